@@ -1,0 +1,77 @@
+"""What every explorer is: a policy that is reset with one seed per episode and maps observations to actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tslam_bench.constants import NUM_JOINTS
+from tslam_bench.errors import InvalidInputError
+
+
+class Baseline(Protocol):
+    """A policy that explores ``num_envs`` objects side by side.
+
+    All random numbers of an episode come from that episode's seed, so the actions do not depend on which other episodes
+    share the batch.
+    """
+
+    def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
+        """Begins ``num_envs`` episodes.
+
+        Args:
+            num_envs: number of episodes in the batch, at least 1.
+            seed: one non-negative seed per episode, or one number from which they are spawned.
+
+        Raises:
+            InvalidInputError: ``num_envs`` or ``seed`` is unusable.
+        """
+
+    def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
+        """Chooses the next actions.
+
+        Args:
+            observation: the entries of protocol section 6 as arrays with a leading ``num_envs`` axis.
+
+        Returns:
+            (num_envs, 28) float32 in [-1, 1], in the joint order of protocol section 2.
+        """
+
+
+def episode_generators(num_envs: int, seed: int | Sequence[int]) -> list[np.random.Generator]:
+    """One independent generator per episode: seed ``s`` of a sequence gives the same generator in every batch.
+
+    Raises:
+        InvalidInputError: ``num_envs`` is below 1, a seed is negative, or the number of seeds is not ``num_envs``.
+    """
+    if num_envs < 1:
+        raise InvalidInputError(f"num_envs {num_envs}: must be at least 1")
+    sequences: list[np.random.SeedSequence]
+    seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
+    if any(s < 0 for s in seeds):
+        raise InvalidInputError(f"seed {min(seeds)}: must not be negative")
+    if isinstance(seed, int | np.integer):
+        sequences = np.random.SeedSequence(int(seed)).spawn(num_envs) if num_envs > 1 else [np.random.SeedSequence(int(seed))]
+    elif len(seeds) == num_envs:
+        sequences = [np.random.SeedSequence(int(s)) for s in seeds]
+    else:
+        raise InvalidInputError(f"seed: {len(seeds)} seeds for {num_envs} episodes; give one per episode, or one number")
+    return [np.random.Generator(np.random.PCG64(sequence)) for sequence in sequences]
+
+
+def check_observation(observation: Mapping[str, NDArray], num_envs: int) -> NDArray:
+    """Returns ``observation["qpos"]`` (num_envs, 28).
+
+    Raises:
+        InvalidInputError: ``qpos`` is missing, or is not of that shape.
+    """
+    qpos = observation.get("qpos")
+    if qpos is None or np.shape(qpos) != (num_envs, NUM_JOINTS):
+        shape = None if qpos is None else np.shape(qpos)
+        raise InvalidInputError(
+            f"observation: qpos has shape {shape}, expected ({num_envs}, {NUM_JOINTS}); call reset(num_envs, seed) first"
+        )
+    return qpos

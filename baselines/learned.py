@@ -1,0 +1,86 @@
+"""Learned explorers: a trained PPO policy behind the interface of every baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+
+from tslam_bench.baselines.interface import check_observation, episode_generators
+from tslam_bench.baselines.registry import BaselineSpec
+from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.errors import InvalidInputError
+
+MODEL_FILE = "model.zip"
+"""The stable-baselines3 archive of a finished model. Loading one runs code it contains: load only models you trust."""
+METADATA_FILE = "model.json"
+"""Written last: a model directory without it is unfinished."""
+
+
+class LearnedBaseline:
+    """Samples from (or acts by the mean of) a trained Gaussian policy; actions are clipped to [-1, 1].
+
+    The noise comes from each episode's seed. The paper acts by the mean; early in training the mean is close to standing
+    still, so sampling, which is also what was optimised, is the default.
+    """
+
+    def __init__(self, model: PPO, deterministic: bool = False) -> None:
+        self._policy = model.policy
+        self._policy.set_training_mode(False)
+        self._deterministic = deterministic
+        self._generators: list[np.random.Generator] = []
+        self._noise = np.zeros((0, HORIZON, NUM_JOINTS), dtype=np.float32)
+        self._step = 0
+        self._deviation = np.exp(self._policy.log_std.detach().numpy())
+
+    @classmethod
+    def load(cls, spec: BaselineSpec, directory: Path | None, deterministic: bool = False) -> LearnedBaseline:
+        """Loads the model that ``tslam-bench baselines train`` wrote to ``directory``.
+
+        Raises:
+            InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
+        """
+        command = f"tslam-bench baselines train {spec.id} --output {directory or 'DIRECTORY'}"
+        if directory is None:
+            raise InvalidInputError(f"baseline {spec.id!r}: needs a trained model; pass its directory, or train one: {command}")
+        directory = Path(directory)
+        if not (directory / METADATA_FILE).is_file() or not (directory / MODEL_FILE).is_file():
+            raise InvalidInputError(f"{directory}: holds no finished model of {spec.id!r}; train it: {command}")
+        try:
+            model = PPO.load(directory / MODEL_FILE, device="cpu")
+        except Exception as error:  # a damaged archive fails in zipfile, pickle or torch
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InvalidInputError(f"{directory / MODEL_FILE}: cannot be read ({reason}); train it again: {command}") from error
+        return cls(model, deterministic)
+
+    def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
+        """See :class:`tslam_bench.baselines.interface.Baseline`."""
+        self._generators = episode_generators(num_envs, seed)
+        self._draw()
+
+    def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
+        """See :class:`tslam_bench.baselines.interface.Baseline`."""
+        check_observation(observation, len(self._generators))
+        with torch.inference_mode():
+            tensors = {key: torch.from_numpy(np.ascontiguousarray(observation[key])) for key in self._keys}
+            features = self._policy.pi_features_extractor(tensors)
+            actions = self._policy.action_net(self._policy.mlp_extractor.forward_actor(features)).numpy()
+        if not self._deterministic:
+            if self._step == HORIZON:
+                self._draw()
+            actions = actions + self._deviation * self._noise[:, self._step]
+            self._step += 1
+        return np.clip(actions, -1, 1).astype(np.float32)
+
+    @property
+    def _keys(self) -> list[str]:
+        return list(self._policy.observation_space.spaces)
+
+    def _draw(self) -> None:
+        blocks = [generator.standard_normal((HORIZON, NUM_JOINTS)) for generator in self._generators]
+        self._noise = np.stack(blocks).astype(np.float32)
+        self._step = 0

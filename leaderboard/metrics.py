@@ -1,0 +1,227 @@
+"""Shape metrics as small pure functions (protocol section 10).
+
+Every distance is in metric units: 1 is the workspace edge, 0.25 m. Callers divide metres by ``WORKSPACE_EDGE``.
+Definitions follow Mescheder et al. (Occupancy Networks, 2019), whose evaluation the tSLAM paper uses, and Knapitsch et al.
+(Tanks and Temples, 2017) for the F-score. ``docs/metrics.md`` lists the traps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
+
+WORST_DISTANCE: Final = math.sqrt(3)
+"""Diagonal of the workspace in metric units: the distance an empty prediction is charged, and the cap of all others."""
+
+
+def iou(predicted: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
+    """Intersection over union of two boolean arrays of one shape: ``|A and B| / |A or B|`` in [0, 1].
+
+    One side empty: 0. Both empty: 1 (equal sets).
+    """
+    predicted, true = np.asarray(predicted, dtype=bool), np.asarray(true, dtype=bool)
+    if predicted.shape != true.shape:
+        raise ValueError(f"iou: shapes {predicted.shape} and {true.shape} differ")
+    union = np.count_nonzero(predicted | true)
+    return np.count_nonzero(predicted & true) / union if union else 1.0
+
+
+def sample_surface(
+    vertices: NDArray, faces: NDArray, count: int, generator: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Area-uniform samples of a triangle mesh, with the normals of the faces they lie on.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: (F, 3) indices, counter-clockwise seen from outside.
+        count: number of samples.
+        generator: the only source of randomness.
+
+    Returns:
+        points (count, 3) in the unit of ``vertices``, unit normals (count, 3).
+
+    Raises:
+        ValueError: the mesh has no area.
+    """
+    triangles = np.asarray(vertices, dtype=np.float64)[np.asarray(faces, dtype=np.int64)]
+    edges_1, edges_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    cross = np.cross(edges_1, edges_2)
+    length = np.linalg.norm(cross, axis=1)
+    cumulative = np.cumsum(length)
+    if len(length) == 0 or not cumulative[-1] > 0:
+        raise ValueError("sample_surface: the mesh has no area")
+    # side="right" never selects a face of zero area.
+    face = np.searchsorted(cumulative, generator.random(count) * cumulative[-1], side="right")
+    face = np.minimum(face, np.flatnonzero(length)[-1])  # guards the rounding of the last interval
+    u, v = generator.random((2, count, 1))
+    folded = u + v > 1
+    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
+    points = triangles[face, 0] + u * edges_1[face] + v * edges_2[face]
+    return points, cross[face] / length[face, None]
+
+
+@dataclass(frozen=True)
+class SurfaceMatch:
+    """Nearest neighbours between samples of a predicted and of a true surface.
+
+    Attributes:
+        accuracy: (P,) distance of every predicted sample to the nearest true one, at most ``WORST_DISTANCE``.
+        completeness: (T,) distance of every true sample to the nearest predicted one, at most ``WORST_DISTANCE``.
+        nearest_true: (P,) index of that true sample.
+        nearest_predicted: (T,) index of that predicted sample.
+    """
+
+    accuracy: NDArray[np.float64]
+    completeness: NDArray[np.float64]
+    nearest_true: NDArray[np.int64]
+    nearest_predicted: NDArray[np.int64]
+
+
+def match_surfaces(predicted: NDArray, true: NDArray, true_tree: cKDTree | None = None, workers: int = 1) -> SurfaceMatch:
+    """Nearest neighbours both ways between samples (P, 3) and (T, 3) in metric units.
+
+    Args:
+        true_tree: ``cKDTree(true)`` if it is at hand.
+        workers: threads of the query; the result does not depend on it.
+    """
+    if len(predicted) == 0 or len(true) == 0:
+        raise ValueError("match_surfaces: a surface without samples has no neighbours; use the worst values instead")
+    true_tree = cKDTree(true) if true_tree is None else true_tree
+    accuracy, nearest_true = true_tree.query(predicted, workers=workers)
+    completeness, nearest_predicted = cKDTree(predicted).query(true, workers=workers)
+    return SurfaceMatch(
+        accuracy=np.minimum(accuracy, WORST_DISTANCE),
+        completeness=np.minimum(completeness, WORST_DISTANCE),
+        nearest_true=nearest_true,
+        nearest_predicted=nearest_predicted,
+    )
+
+
+def chamfer_l2(match: SurfaceMatch) -> float:
+    """``0.5 * (mean_p d(p, GT)^2 + mean_q d(q, P)^2)``, squared metric units; an empty prediction has 3.
+
+    Of a surface of area A with itself, N samples a side, it is A / (pi N), not 0: the samples differ.
+    """
+    return 0.5 * float(np.mean(match.accuracy**2) + np.mean(match.completeness**2))
+
+
+def chamfer_l1(match: SurfaceMatch) -> float:
+    """``0.5 * (mean_p d(p, GT) + mean_q d(q, P))``, metric units; an empty prediction has sqrt(3)."""
+    return 0.5 * float(np.mean(match.accuracy) + np.mean(match.completeness))
+
+
+def normal_consistency(predicted_normals: NDArray, true_normals: NDArray, match: SurfaceMatch) -> float:
+    """Mean of both directions of ``|n . n_nearest|`` in [0, 1]; an empty prediction has 0.
+
+    Unoriented: normals at random give 0.5, the voxel faces of a finely voxelised sphere 0.83.
+
+    Args:
+        predicted_normals, true_normals: (P, 3) and (T, 3) unit normals of the matched samples.
+    """
+    there = np.abs(np.einsum("ij,ij->i", predicted_normals, true_normals[match.nearest_true]))
+    back = np.abs(np.einsum("ij,ij->i", true_normals, predicted_normals[match.nearest_predicted]))
+    return 0.5 * float(there.mean() + back.mean())
+
+
+def f_score(match: SurfaceMatch, distance: float) -> float:
+    """Harmonic mean of precision (predicted samples within ``distance`` of the truth) and recall; 0 if both are 0.
+
+    Args:
+        distance: threshold in metric units.
+    """
+    precision = float(np.mean(match.accuracy <= distance))
+    recall = float(np.mean(match.completeness <= distance))
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def surface_iou(touched: NDArray[np.bool_], surface: NDArray[np.bool_]) -> float:
+    """IoU of touched voxels with the voxels that the true surface crosses, (32, 32, 32) each. Never called IoU alone."""
+    return iou(touched, surface)
+
+
+class TouchCoverage:
+    """Which true surface samples have a touched voxel near, and since when.
+
+    A sample is covered once a voxel whose centre lies within one voxel edge of it is touched. Only the 27 voxels around a
+    sample can be that near, so the candidates are found once per object.
+    """
+
+    def __init__(self, surface_points: NDArray) -> None:
+        """Args: surface_points: (T, 3) true surface samples, metres, object frame, inside W."""
+        self.count = len(surface_points)
+        cells = (np.asarray(surface_points, dtype=np.float64) - WORKSPACE_LOW) / VOXEL_EDGE
+        home = np.floor(cells).astype(np.int64)
+        if self.count == 0 or (home < 0).any() or (home >= GRID_SIZE).any():
+            raise ValueError("TouchCoverage: the surface samples must be non-empty and lie inside the workspace")
+        offsets = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        near = np.empty((self.count, len(offsets)), dtype=bool)
+        for column, offset in enumerate(offsets):
+            near[:, column] = np.square(home + offset + 0.5 - cells).sum(axis=1) <= 1.0
+        sample, column = np.nonzero(near)
+        # One layer of padding: a neighbour outside W is never touched.
+        self._padded_size = GRID_SIZE + 2
+        self._voxel = np.ravel_multi_index((home[sample] + offsets[column] + 1).T, (self._padded_size,) * 3)
+        # Every sample has at least its own voxel (at most sqrt(3)/2 edges away), so no segment is empty.
+        self._start = np.searchsorted(sample, np.arange(self.count))
+
+    def first_step(self, touched_step: NDArray) -> NDArray[np.int64]:
+        """Step at which every sample was first covered.
+
+        Args:
+            touched_step: (32, 32, 32) integers, object frame: step at which a voxel was first touched, -1 for never.
+
+        Returns:
+            (T,) steps; the largest int64 for samples never covered.
+        """
+        never = np.iinfo(np.int64).max
+        steps = np.full((self._padded_size,) * 3, never, dtype=np.int64)
+        steps[1:-1, 1:-1, 1:-1] = np.where(touched_step >= 0, touched_step, never)
+        return np.minimum.reduceat(steps.reshape(-1)[self._voxel], self._start)
+
+    def recall(self, touched: NDArray[np.bool_]) -> float:
+        """Touched-surface recall: share of the samples that touched voxels (32, 32, 32) cover."""
+        first = self.first_step(np.where(touched, 0, -1))
+        return float(np.mean(first == 0))
+
+    def recall_curve(self, touched_step: NDArray, steps: int) -> NDArray[np.float64]:
+        """Recall after 0, 1, ..., ``steps`` control steps: (steps + 1,), starting at 0.
+
+        ``touched_step`` counts from 0: a voxel touched in step 0 counts after 1 step.
+        """
+        first = self.first_step(touched_step)
+        counts = np.bincount(first[first < steps], minlength=steps)
+        return np.concatenate([[0.0], np.cumsum(counts)]) / self.count
+
+
+def surface_iou_curve(touched_step: NDArray, surface: NDArray[np.bool_], steps: int) -> NDArray[np.float64]:
+    """:func:`surface_iou` after 0, 1, ..., ``steps`` control steps: (steps + 1,).
+
+    Args:
+        touched_step: (32, 32, 32) integers: step (from 0) at which a voxel was first touched, -1 for never.
+        surface: (32, 32, 32) bool, not empty.
+    """
+    first = touched_step.astype(np.int64)
+    on, off = first[surface], first[~surface]
+    hits = np.cumsum(np.bincount(on[(on >= 0) & (on < steps)], minlength=steps))
+    misses = np.cumsum(np.bincount(off[(off >= 0) & (off < steps)], minlength=steps))
+    return np.concatenate([[0.0], hits / (np.count_nonzero(surface) + misses)])
+
+
+def area_under_curve(values: NDArray) -> float:
+    """Mean height of a curve sampled at equal steps, by the trapezoidal rule; 1 for a curve that is 1 throughout."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim != 1 or len(values) < 2:
+        raise ValueError(f"area_under_curve: shape {values.shape}, expected at least two values in one dimension")
+    return float(np.trapezoid(values) if hasattr(np, "trapezoid") else np.trapz(values)) / (len(values) - 1)
+
+
+def to_metric(metres: NDArray) -> NDArray[np.float64]:
+    """Metres -> metric units."""
+    return np.asarray(metres, dtype=np.float64) / WORKSPACE_EDGE

@@ -1,0 +1,370 @@
+"""Touch and coverage, batched over environments: probes, signed distance, contact points, voxel sets (section 5).
+
+The same code runs on numpy arrays (CPU simulation) and on torch tensors (GPU simulation, or CPU tensors in tests): it uses
+only elementwise arithmetic, gathers and order-free scatters, which both libraries compute with the same bits on a CPU
+and which do not depend on how many environments are batched.
+
+Arrays are ``(environments, ...)``; E environments, P probes, N = 32 voxels per axis. World frame, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from tslam_bench import grids
+from tslam_bench.assets.store import SignedDistanceField
+from tslam_bench.constants import GRID_SIZE, TOUCH_DISTANCE, VOXEL_EDGE, WORKSPACE_LOW
+from tslam_bench.tasks.arrays import Backend
+from tslam_bench.tasks.skin import PointSet, Skin
+
+Array = Any
+"""numpy.ndarray or torch.Tensor, as the backend says."""
+
+VOXELS = GRID_SIZE**3
+MAX_NEW_CONTACTS = 64
+"""New contact points kept per environment and step (the first in probe order); more than that is a whole palm landing."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What one control step felt.
+
+    Attributes:
+        on: (E, P) bool, probes that are on.
+        new: (E, P) bool, probes on now that were off one step before.
+        points: (E, MAX_NEW_CONTACTS, 3) float32 contact points of new probes, zero where ``mask`` is False.
+        mask: (E, MAX_NEW_CONTACTS) bool.
+        new_touched: (E,) int64, |T_t minus T_(t-1)| (paper eq. 2).
+        new_visited: (E,) int64, |V_t minus V_(t-1)| (paper eq. 3).
+    """
+
+    on: Array
+    new: Array
+    points: Array
+    mask: Array
+    new_touched: Array
+    new_visited: Array
+
+
+class FieldAtlas:
+    """Signed-distance fields of several objects in one flat array, so that environments with different objects share a gather."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self._index: dict[str, int] = {}
+        self._fields: list[SignedDistanceField] = []
+        self._offsets: list[int] = []
+        self._stale = True
+        self.values: Array = None
+
+    def add(self, name: str, field: SignedDistanceField) -> int:
+        """Index of the field called ``name``, adding it on first use."""
+        if name not in self._index:
+            self._index[name] = len(self._fields)
+            self._offsets.append(sum(f.values.size for f in self._fields))
+            self._fields.append(field)
+            self._stale = True
+        return self._index[name]
+
+    def build(self) -> None:
+        """Joins the fields that were added since the last call."""
+        if not self._stale:
+            return
+        values = np.concatenate([f.values.reshape(-1).astype(np.float32) for f in self._fields])
+        self.values = self._backend.array(values)
+        self._stale = False
+
+    def parameters(self, index: int) -> tuple[int, tuple[int, int, int], np.ndarray, float]:
+        """(offset into ``values``, samples per axis, (3,) origin, spacing) of a field."""
+        field = self._fields[index]
+        nx, ny, nz = field.values.shape
+        return self._offsets[index], (nx, ny, nz), np.asarray(field.origin, dtype=np.float64), float(field.spacing)
+
+
+class TactileSensing:
+    """Senses E environments at once and accumulates their touched and visited grids.
+
+    Args:
+        num_envs: E.
+        skin: probes and volume points.
+        backend: numpy or torch.
+    """
+
+    def __init__(self, num_envs: int, skin: Skin, backend: Backend) -> None:
+        self.num_envs = num_envs
+        self.backend = backend
+        self._xp: ModuleType = backend.module
+        self._probes = _BoundPoints(skin.probes, backend)
+        self._volume = _BoundPoints(skin.volume, backend)
+        self._num_links = int(skin.volume.link.max()) + 1
+        self._probe_reach = backend.array(skin.probes.radius + np.float32(TOUCH_DISTANCE))
+        link_of_probe = np.zeros((len(skin.probes), self._num_links), dtype=bool)
+        link_of_probe[np.arange(len(skin.probes)), skin.probes.link] = True
+        self._first_probe = np.searchsorted(skin.probes.link, np.arange(self._num_links))
+        self._link_of_probe = backend.array(link_of_probe.astype(np.float32))
+        self.atlas = FieldAtlas(backend)
+
+        zeros, flat = backend.zeros, num_envs * VOXELS + 1  # the last element takes what lies outside W
+        self._touched = zeros(flat, bool)
+        self._visited = zeros(flat, bool)
+        self._touched_step = backend.full(flat, -1, np.int16)
+        self._winner = zeros(flat, np.int64)
+        self._on = zeros((num_envs, len(skin.probes)), bool)
+        self._env_base = backend.array(np.arange(num_envs, dtype=np.int64)[:, None] * VOXELS)
+        self._env_row = backend.array(np.arange(num_envs, dtype=np.int64)[:, None])
+
+        # Per environment, of its object and pose; host copies, pushed to the device after a reset.
+        self._field_of_env = np.zeros(num_envs, dtype=np.int64)
+        self._turn_host = np.tile(np.eye(3, dtype=np.float32), (num_envs, 1, 1))
+        self._bound = False
+
+    # -- grids ------------------------------------------------------------------------------------------------
+    @property
+    def touched(self) -> Array:
+        """(E, 32, 32, 32) bool, touched since the episode began; a view."""
+        return self._touched[:-1].reshape(self.num_envs, GRID_SIZE, GRID_SIZE, GRID_SIZE)
+
+    @property
+    def visited(self) -> Array:
+        """(E, 32, 32, 32) bool, visited since the episode began; a view."""
+        return self._visited[:-1].reshape(self.num_envs, GRID_SIZE, GRID_SIZE, GRID_SIZE)
+
+    @property
+    def touched_step(self) -> Array:
+        """(E, 32, 32, 32) int16, control step (1 = first) of the first touch, -1 where never touched; a view."""
+        return self._touched_step[:-1].reshape(self.num_envs, GRID_SIZE, GRID_SIZE, GRID_SIZE)
+
+    @property
+    def on(self) -> Array:
+        """(E, P) bool, probes that are on."""
+        return self._on
+
+    # -- episodes ---------------------------------------------------------------------------------------------
+    def set_object(self, env: int, name: str, field: SignedDistanceField, pose: int) -> None:
+        """Puts an object in a pose into one environment; call :meth:`begin` before the next step."""
+        self._field_of_env[env] = self.atlas.add(name, field)
+        self._turn_host[env] = grids.pose_rotation(pose)
+        self._bound = False
+
+    def begin(self, envs: Sequence[int]) -> None:
+        """Clears the grids and probe memory of ``envs`` for a new episode."""
+        if not self._bound:
+            self._bind()
+        for grid, value in ((self._touched, False), (self._visited, False), (self._touched_step, -1)):
+            rows = grid[:-1].reshape(self.num_envs, VOXELS)
+            rows[list(envs)] = value
+        self._on[list(envs)] = False
+
+    def _bind(self) -> None:
+        self.atlas.build()
+        parameters = [self.atlas.parameters(int(i)) for i in self._field_of_env]
+        array = self.backend.array
+        offsets, sizes, origins, spacings = zip(*parameters, strict=True)
+        strides = [(ny * nz, nz, 1) for _, ny, nz in sizes]
+        self._offset = array(np.array(offsets, dtype=np.int64)[:, None])
+        self._stride = [array(np.array([s[a] for s in strides], dtype=np.int64)[:, None]) for a in range(3)]
+        self._last_cell = [array(np.array([s[a] - 2 for s in sizes], dtype=np.float32)[:, None]) for a in range(3)]
+        self._origin = [array(np.array([o[a] for o in origins], dtype=np.float32)[:, None]) for a in range(3)]
+        self._spacing = array(np.array(spacings, dtype=np.float32)[:, None])
+        self._inverse_spacing = array((1.0 / np.array(spacings)).astype(np.float32)[:, None])
+        # A sample is at most half a cell diagonal away from a point, and distance is 1-Lipschitz.
+        self._cull_margin = array((np.sqrt(3.0) / 2 * 1.001 * np.array(spacings)).astype(np.float32)[:, None])
+        self._turn = [[array(self._turn_host[:, a, b, None].copy()) for b in range(3)] for a in range(3)]
+        self._bound = True
+
+    # -- one step ---------------------------------------------------------------------------------------------
+    def step(self, link_matrices: Array, step: Array) -> Contacts:
+        """Senses the hand where it is now and updates the grids.
+
+        Args:
+            link_matrices: (E, L, 3, 4) float32, pose of every skin link in the world.
+            step: (E,) int, control steps done in the episode (1 after the first).
+
+        Returns:
+            The step's contacts.
+        """
+        components = link_matrices.reshape(self.num_envs, self._num_links, 12)
+        on, values = self._touch(components)
+        new = on & ~self._on
+        self._on = on
+        new_touched, points, mask = self._touch_voxels(components, on, new, values, step)
+        new_visited = self._visit_voxels(components)
+        return Contacts(on, new, points, mask, new_touched, new_visited)
+
+    def link_touch(self) -> Array:
+        """(E, L) bool: a link's touch bit is on when any of its probes is."""
+        if self.backend.is_numpy:
+            return np.logical_or.reduceat(self._on, self._first_probe, axis=1)
+        return (self._on.to(self._link_of_probe.dtype) @ self._link_of_probe) > 0  # 0/1 sums: exact
+
+    def _touch(self, components: Array) -> tuple[Array, Array]:
+        """(E, P) probes on, and what the contact points need: object-frame cells of the probes."""
+        xp = self._xp
+        local = self._to_object_frame(components)
+        u = [(p - o) * self._inverse_spacing for p, o in zip(self._probes.place(local), self._origin, strict=True)]
+        nearest = self._offset
+        for axis in range(3):
+            cell = xp.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
+            nearest = nearest + self.backend.integer(cell) * self._stride[axis]
+        near = self.backend.take(self.atlas.values, nearest) <= self._probe_reach + self._cull_margin
+        rows, columns = self.backend.select(near)
+        cells = _Cells(self, [c[rows, columns] for c in u], rows)
+        felt = cells.value() <= self._probe_reach[columns]
+        on = self.backend.zeros(near.shape, bool)
+        on[rows, columns] = felt & near[rows, columns]
+        return on, u
+
+    def _touch_voxels(
+        self, components: Array, on: Array, new: Array, u: list[Array], step: Array
+    ) -> tuple[Array, Array, Array]:
+        backend, xp = self.backend, self._xp
+        rows, columns = backend.select(on)
+        flags = on[rows, columns]
+        cells = _Cells(self, [c[rows, columns] for c in u], rows)
+        distance, gradient = cells.value(), cells.unit_gradient()
+        world = []
+        object_points = [
+            (c * self._spacing[rows, 0] + o[rows, 0]) - distance * g
+            for c, o, g in zip([c[rows, columns] for c in u], self._origin, gradient, strict=True)
+        ]
+        for axis in range(3):
+            turn = self._turn[axis]
+            world.append(
+                turn[0][rows, 0] * object_points[0]
+                + turn[1][rows, 0] * object_points[1]
+                + turn[2][rows, 0] * object_points[2]
+            )
+        key = self._voxel_key(world, self._env_base[rows, 0])
+        key = xp.where(flags, key, self.num_envs * VOXELS)
+        fresh = self._first_of_each(self._touched, key)
+        backend.put(self._touched_step, xp.where(fresh, key, self.num_envs * VOXELS), backend.int16(step[rows]))
+        self._touched_step[-1] = -1
+        backend.put(self._touched, key, True)
+        self._touched[-1] = False
+        new_touched = backend.count_rows(fresh, rows, self.num_envs)
+        points, mask = self._new_points(world, flags & new[rows, columns], rows)
+        return new_touched, points, mask
+
+    def _new_points(self, world: list[Array], flags: Array, rows: Array) -> tuple[Array, Array]:
+        """The first MAX_NEW_CONTACTS flagged points of each environment, in probe order."""
+        backend, xp = self.backend, self._xp
+        points = backend.zeros((self.num_envs, MAX_NEW_CONTACTS + 1, 3), np.float32)
+        mask = backend.zeros((self.num_envs, MAX_NEW_CONTACTS + 1), bool)
+        total = xp.cumsum(backend.integer(flags), 0)  # rows are sorted, so ranks restart by subtraction
+        before = backend.count_rows(flags, rows, self.num_envs)
+        start = xp.cumsum(before, 0) - before
+        rank = total - 1 - start[rows]
+        slot = xp.where(flags & (rank < MAX_NEW_CONTACTS), rank, MAX_NEW_CONTACTS)  # the last slot is thrown away
+        mask[rows, slot] = True
+        for axis in range(3):
+            points[rows, slot, axis] = world[axis]
+        return points[:, :MAX_NEW_CONTACTS], mask[:, :MAX_NEW_CONTACTS]
+
+    def _visit_voxels(self, components: Array) -> Array:
+        placed = self._volume.place(components.transpose(2, 0, 1) if self.backend.is_numpy else components.permute(2, 0, 1))
+        key = self._voxel_key(placed, self._env_base)
+        fresh = self._first_of_each(self._visited, key)
+        self.backend.put(self._visited, key, True)
+        self._visited[-1] = False
+        return fresh.sum(1)
+
+    def _to_object_frame(self, components: Array) -> Array:
+        """(12, E, L) link poses turned into the object's frame; exact, since turns are signed permutations."""
+        parts = [components[:, :, k] for k in range(12)]
+        turned: list[Array] = [None] * 12
+        for column in range(4):
+            world = [parts[4 * row + column] for row in range(3)]
+            for row in range(3):  # transpose of the turn: world -> object
+                turn = [self._turn[k][row] for k in range(3)]
+                turned[4 * row + column] = turn[0] * world[0] + turn[1] * world[1] + turn[2] * world[2]
+        return self._xp.stack(turned, 0)
+
+    def _voxel_key(self, points: list[Array], base: Array) -> Array:
+        """Flat voxel index of points, or the spare last element where they lie outside W."""
+        xp = self._xp
+        inside, key = None, base
+        for axis, stride in zip(range(3), (GRID_SIZE * GRID_SIZE, GRID_SIZE, 1), strict=True):
+            cell = xp.floor((points[axis] - np.float32(WORKSPACE_LOW).item()) * np.float32(1 / VOXEL_EDGE).item())
+            within = (cell >= 0) & (cell < GRID_SIZE)
+            inside = within if inside is None else inside & within
+            key = key + self.backend.integer(cell) * stride
+        return xp.where(inside, key, self.num_envs * VOXELS)
+
+    def _first_of_each(self, grid: Array, key: Array) -> Array:
+        """True for exactly one entry per voxel that ``key`` names and ``grid`` does not hold yet.
+
+        Which entry wins a voxel is not defined, how many win is: the count is deterministic on any device.
+        """
+        backend = self.backend
+        flat = key.reshape(-1)
+        order = backend.arange(flat.shape[0])
+        backend.put(self._winner, flat, order)
+        first = (backend.take(self._winner, flat) == order) & ~backend.take(grid, flat)
+        return (first & (flat != self.num_envs * VOXELS)).reshape(key.shape)
+
+
+class _BoundPoints:
+    """A point set on the backend's device."""
+
+    def __init__(self, points: PointSet, backend: Backend) -> None:
+        self._backend = backend
+        self._link = backend.array(points.link)
+        self._local = [backend.array(np.ascontiguousarray(points.position[:, a])) for a in range(3)]
+
+    def place(self, components: Array) -> list[Array]:
+        """World coordinates, three (E, P) arrays, for (12, E, L) link poses (rows of [R | t])."""
+        parts = self._backend.take_last(components, self._link)
+        x, y, z = self._local
+        return [
+            parts[4 * row] * x + parts[4 * row + 1] * y + parts[4 * row + 2] * z + parts[4 * row + 3] for row in range(3)
+        ]
+
+
+class _Cells:
+    """Trilinear interpolation of the fields at a list of points: grid coordinates ``u``, environments ``rows``."""
+
+    def __init__(self, sensing: TactileSensing, u: list[Array], rows: Array) -> None:
+        xp, backend = sensing._xp, sensing.backend
+        index, fraction = sensing._offset[rows, 0], []
+        strides = []
+        for axis in range(3):
+            low = xp.clip(xp.floor(u[axis]), 0.0, sensing._last_cell[axis][rows, 0])
+            fraction.append(xp.clip(u[axis] - low, 0.0, 1.0))
+            strides.append(sensing._stride[axis][rows, 0])
+            index = index + backend.integer(low) * strides[axis]
+        self._xp, self._fraction = xp, fraction
+        values = sensing.atlas.values
+        corner = {}
+        for i in (0, 1):
+            for j in (0, 1):
+                for k in (0, 1):
+                    at = index + i * strides[0] + j * strides[1] + k * strides[2]
+                    corner[i, j, k] = backend.take(values, at)
+        self._corner = corner
+
+    def value(self) -> Array:
+        """Signed distance (m)."""
+        c, (fx, fy, fz) = self._corner, self._fraction
+        along_x = {(j, k): c[0, j, k] + fx * (c[1, j, k] - c[0, j, k]) for j in (0, 1) for k in (0, 1)}
+        along_y = {k: along_x[0, k] + fy * (along_x[1, k] - along_x[0, k]) for k in (0, 1)}
+        return along_y[0] + fz * (along_y[1] - along_y[0])
+
+    def unit_gradient(self) -> list[Array]:
+        """Gradient of the trilinear field, scaled to length 1."""
+        c, (fx, fy, fz) = self._corner, self._fraction
+        gx = _bilinear(fy, fz, *(c[1, j, k] - c[0, j, k] for j in (0, 1) for k in (0, 1)))
+        gy = _bilinear(fx, fz, *(c[i, 1, k] - c[i, 0, k] for i in (0, 1) for k in (0, 1)))
+        gz = _bilinear(fx, fy, *(c[i, j, 1] - c[i, j, 0] for i in (0, 1) for j in (0, 1)))
+        length = self._xp.sqrt(gx * gx + gy * gy + gz * gz) + 1e-12
+        return [gx / length, gy / length, gz / length]
+
+
+def _bilinear(a: Array, b: Array, v00: Array, v01: Array, v10: Array, v11: Array) -> Array:
+    low = v00 + b * (v01 - v00)
+    high = v10 + b * (v11 - v10)
+    return low + a * (high - low)

@@ -1,0 +1,23 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import pytest
+from objects import prepared_box, prepared_sphere, prepared_torus
+
+from tslam_bench.assets.store import PreparedObject
+
+
+@pytest.fixture(scope="session")
+def box() -> PreparedObject:
+    return prepared_box()
+
+
+@pytest.fixture(scope="session")
+def sphere() -> PreparedObject:
+    return prepared_sphere()
+
+
+@pytest.fixture(scope="session")
+def torus() -> PreparedObject:
+    return prepared_torus()

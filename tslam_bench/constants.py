@@ -1,0 +1,76 @@
+"""The benchmark's constants: each number of the protocol has its one home here.
+
+Section numbers refer to the protocol definition (``docs/protocol.md``). Units are metres, radians and seconds.
+This module imports nothing, so that scoring can read it without a simulator.
+"""
+
+from typing import Final
+
+PROTOCOL_VERSION: Final = 1
+"""Bumped whenever an observation, a reward, a metric or a split changes."""
+
+ENVIRONMENT_ID: Final = "TactileSLAM-v0"
+"""Gymnasium id of the default task."""
+
+# --- Section 1: workspace and grid -----------------------------------------------------------------------------
+WORKSPACE_EDGE: Final = 0.25
+"""Edge of the cubic workspace W (m), centred on the object's bounding-box centre. Also the metric unit."""
+GRID_SIZE: Final = 32
+"""Voxels per axis of every occupancy grid."""
+VOXEL_EDGE: Final = WORKSPACE_EDGE / GRID_SIZE
+"""Edge of one voxel (m): 7.8125 mm."""
+WORKSPACE_LOW: Final = -WORKSPACE_EDGE / 2
+"""Lower corner of W on every axis (m): the workspace centre is the world origin and the object-frame origin."""
+
+# --- Section 2: hand -------------------------------------------------------------------------------------------
+NUM_JOINTS: Final = 28
+"""Actuated joints of the hand on its arm; also the length of an action."""
+
+# --- Section 3: poses ------------------------------------------------------------------------------------------
+NUM_POSES: Final = 8
+PROTOCOL_POSES: Final[dict[int, tuple[int, ...]]] = {4: (0, 2, 5, 7), 8: (0, 1, 2, 3, 4, 5, 6, 7)}
+"""Pose indices of the 4-pose and the 8-pose protocol."""
+
+# --- Section 4: time -------------------------------------------------------------------------------------------
+PHYSICS_FREQUENCY: Final = 133
+"""Physics steps per second."""
+SUBSTEPS: Final = 4
+"""Physics steps per control step (30.1 ms)."""
+HORIZON: Final = 200
+"""Control steps per episode (6.0 s)."""
+
+# --- Section 5: touch ------------------------------------------------------------------------------------------
+TOUCH_DISTANCE: Final = 1e-3
+"""A probe is on when signed distance minus probe radius is at most this (m)."""
+SIGNED_DISTANCE_TOLERANCE: Final = 0.5e-3
+"""Largest error of a signed-distance field at the surface (m)."""
+
+# --- Section 8: objects ----------------------------------------------------------------------------------------
+QUICK_OBJECTS: Final = ("mug", "stanfordbunny", "toruslarge", "wineglass", "hammer")
+"""Test objects of the quick run."""
+REACHABLE_BALL_RADIUS: Final = 3e-3
+"""Inner voids that a ball of this radius (m) cannot enter from outside count as solid."""
+SURFACE_SAMPLES: Final = 100_000
+"""Area-uniform samples per true surface, and per predicted one."""
+
+# --- Section 10: metrics ---------------------------------------------------------------------------------------
+IOU_POINTS: Final = 100_000
+"""Uniform points in W at which solid occupancies are compared."""
+OCCUPANCY_THRESHOLD: Final = 0.5
+"""A reconstruction is solid where its probability is at least this."""
+F_SCORE_DISTANCES: Final = (0.01, 0.02)
+"""F-score thresholds in metric units (1 % and 2 % of the workspace edge)."""
+
+# --- Section 7: rewards ----------------------------------------------------------------------------------------
+REWARD_MODES: Final = (
+    "tslam",
+    "no_coverage",
+    "no_discovery",
+    "points",
+    "contact",
+    "knn",
+    "disagreement",
+    "chamfer",
+)
+PRIVILEGED_REWARD_MODES: Final = ("chamfer",)
+"""Reward modes that read the true surface."""

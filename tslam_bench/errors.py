@@ -1,0 +1,13 @@
+"""Errors a user can cause. Each message is one line: what is wrong, where, and the remedy."""
+
+
+class BenchmarkError(Exception):
+    """Base class; command lines print its message on one line and exit with status 2."""
+
+
+class InvalidInputError(BenchmarkError, ValueError):
+    """An argument, a file or a submission is not what it has to be."""
+
+
+class AssetError(BenchmarkError, RuntimeError):
+    """Asset data is missing, corrupt, or cannot be fetched or written."""

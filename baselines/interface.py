@@ -49,16 +49,15 @@ def episode_generators(num_envs: int, seed: int | Sequence[int]) -> list[np.rand
     """
     if num_envs < 1:
         raise InvalidInputError(f"num_envs {num_envs}: must be at least 1")
-    sequences: list[np.random.SeedSequence]
-    seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
+    single = isinstance(seed, int | np.integer)
+    seeds = [int(seed)] if single else [int(s) for s in seed]  # type: ignore[arg-type, union-attr]
     if any(s < 0 for s in seeds):
         raise InvalidInputError(f"seed {min(seeds)}: must not be negative")
-    if isinstance(seed, int | np.integer):
-        sequences = np.random.SeedSequence(int(seed)).spawn(num_envs) if num_envs > 1 else [np.random.SeedSequence(int(seed))]
-    elif len(seeds) == num_envs:
-        sequences = [np.random.SeedSequence(int(s)) for s in seeds]
-    else:
-        raise InvalidInputError(f"seed: {len(seeds)} seeds for {num_envs} episodes; give one per episode, or one number")
+    if not single and len(seeds) != num_envs:
+        raise InvalidInputError(f"seed: {len(seeds)} seeds for {num_envs} episodes; give one per episode, or a number")
+    sequences = [np.random.SeedSequence(s) for s in seeds]
+    if single and num_envs > 1:
+        sequences = sequences[0].spawn(num_envs)
     return [np.random.Generator(np.random.PCG64(sequence)) for sequence in sequences]
 
 
@@ -72,6 +71,6 @@ def check_observation(observation: Mapping[str, NDArray], num_envs: int) -> NDAr
     if qpos is None or np.shape(qpos) != (num_envs, NUM_JOINTS):
         shape = None if qpos is None else np.shape(qpos)
         raise InvalidInputError(
-            f"observation: qpos has shape {shape}, expected ({num_envs}, {NUM_JOINTS}); call reset(num_envs, seed) first"
+            f"observation: qpos has shape {shape}, expected ({num_envs}, {NUM_JOINTS}); call reset first"
         )
     return qpos

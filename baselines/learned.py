@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
@@ -24,8 +25,8 @@ METADATA_FILE = "model.json"
 class LearnedBaseline:
     """Samples from (or acts by the mean of) a trained Gaussian policy; actions are clipped to [-1, 1].
 
-    The noise comes from each episode's seed. The paper acts by the mean; early in training the mean is close to standing
-    still, so sampling, which is also what was optimised, is the default.
+    The noise comes from each episode's seed. The paper acts by the mean; early in training the mean is close to
+    standing still, so sampling, which is also what was optimised, is the default.
     """
 
     def __init__(self, model: PPO, deterministic: bool = False) -> None:
@@ -46,7 +47,9 @@ class LearnedBaseline:
         """
         command = f"tslam-bench baselines train {spec.id} --output {directory or 'DIRECTORY'}"
         if directory is None:
-            raise InvalidInputError(f"baseline {spec.id!r}: needs a trained model; pass its directory, or train one: {command}")
+            raise InvalidInputError(
+                f"baseline {spec.id!r}: needs a trained model; pass its directory, or train one: {command}"
+            )
         directory = Path(directory)
         if not (directory / METADATA_FILE).is_file() or not (directory / MODEL_FILE).is_file():
             raise InvalidInputError(f"{directory}: holds no finished model of {spec.id!r}; train it: {command}")
@@ -54,7 +57,9 @@ class LearnedBaseline:
             model = PPO.load(directory / MODEL_FILE, device="cpu")
         except Exception as error:  # a damaged archive fails in zipfile, pickle or torch
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InvalidInputError(f"{directory / MODEL_FILE}: cannot be read ({reason}); train it again: {command}") from error
+            raise InvalidInputError(
+                f"{directory / MODEL_FILE}: cannot be read ({reason}); train it again: {command}"
+            ) from error
         return cls(model, deterministic)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
@@ -78,7 +83,9 @@ class LearnedBaseline:
 
     @property
     def _keys(self) -> list[str]:
-        return list(self._policy.observation_space.spaces)
+        space = self._policy.observation_space
+        assert isinstance(space, spaces.Dict)
+        return list(space.spaces)
 
     def _draw(self) -> None:
         blocks = [generator.standard_normal((HORIZON, NUM_JOINTS)) for generator in self._generators]

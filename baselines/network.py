@@ -1,7 +1,7 @@
 """The policy network of protocol section 11: six 3D convolutions on the grids, joined by the joint angles, then an MLP.
 
-Full-resolution 3D convolutions cost tens of milliseconds per sample on a CPU (87 ms forward and backward for 8 channels),
-so the first layer strides: by 4 in ``small`` (0.5 ms) and by 2 in ``paper`` (3.4 ms).
+Full-resolution 3D convolutions cost tens of milliseconds per sample on a CPU (87 ms forward and backward for 8
+channels), so the first layer strides: by 4 in ``small`` (0.5 ms) and by 2 in ``paper`` (3.4 ms).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class NetworkConfig:
         channels: output channels of the six convolutions.
         kernels: kernel edge of each, in voxels of its input.
         strides: stride of each.
-        hidden: width of the MLP's hidden layers, for the policy and again for the value; with its output layer the MLP has four
-            layers.
+        hidden: width of the MLP's hidden layers, for the policy and again for the value; with its output layer the MLP
+            has four layers.
         log_std: initial log standard deviation of the Gaussian policy.
     """
 
@@ -55,7 +55,8 @@ NETWORKS: Final[dict[str, NetworkConfig]] = {
 class GridAndJointsExtractor(BaseFeaturesExtractor):
     """Six 3D convolutions on the grids, concatenated with every other entry of the observation.
 
-    Entries are brought to the order of 1: joint positions by their limits to [-1, 1], joint velocities by ``velocity_scale``.
+    Entries are brought to the order of 1: joint positions by their limits to [-1, 1], joint velocities by
+    ``velocity_scale``.
 
     Args:
         observation_space: dict with ``occupancy`` (2, 32, 32, 32) and flat entries of shape (k,).
@@ -113,7 +114,7 @@ class GridAndJointsExtractor(BaseFeaturesExtractor):
 
 
 def policy_arguments(network: NetworkConfig, joint_limits: tuple[tuple[float, float], ...]) -> dict[str, Any]:
-    """``policy_kwargs`` for stable-baselines3's ``MultiInputPolicy``: the extractor, a 4-layer MLP each for policy and value, Adam."""
+    """``policy_kwargs`` for ``MultiInputPolicy``: the extractor, a 4-layer MLP each for policy and value, Adam."""
     return {
         "features_extractor_class": GridAndJointsExtractor,
         "features_extractor_kwargs": {

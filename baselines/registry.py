@@ -17,8 +17,8 @@ class BaselineSpec:
     Attributes:
         id: fixed identifier.
         summary: one line for listings.
-        kind: ``scripted`` (acts by rule), ``learned`` (needs a trained model) or ``reference`` (no policy: the grids come from
-            the ground truth or stay empty).
+        kind: ``scripted`` (acts by rule), ``learned`` (needs a trained model) or ``reference`` (no policy: the grids
+            come from the ground truth or stay empty).
         reward_mode: reward that a learned explorer is trained with (protocol section 7); None for the others.
         privileged: training or exploration reads the true shape, so the entry is marked in every ranking.
     """
@@ -44,7 +44,9 @@ _SPECS = (
     _learned("tslam_points", "points", "PPO on the number of new contact points, plus coverage"),
     _learned("tslam_contact", "contact", "PPO on being in contact, plus coverage"),
     _learned("tslam_disagreement", "disagreement", "PPO on the change of the contacts' alpha shape, plus coverage"),
-    _learned("tslam_chamfer", "chamfer", "PPO on the Chamfer distance to the true surface, plus coverage", privileged=True),
+    _learned(
+        "tslam_chamfer", "chamfer", "PPO on the Chamfer distance to the true surface, plus coverage", privileged=True
+    ),
     BaselineSpec("oracle", "reference: every surface voxel touched", "reference", privileged=True),
     BaselineSpec("nothing", "reference: nothing touched", "reference", privileged=True),
 )
@@ -77,12 +79,14 @@ def make_baseline(identifier: str, model: Path | None = None, deterministic: boo
         deterministic: a learned explorer acts by the mean of its policy instead of sampling from it.
 
     Raises:
-        InvalidInputError: unknown id, a reference (it has no policy), or a missing or unreadable model (the message gives the
-            training command).
+        InvalidInputError: unknown id, a reference (it has no policy), or a missing or unreadable model (the message
+            gives the training command).
     """
     spec = get_baseline(identifier)
     if spec.kind == "reference":
-        raise InvalidInputError(f"baseline {identifier!r}: a reference has no policy; evaluate it instead of acting with it")
+        raise InvalidInputError(
+            f"baseline {identifier!r}: a reference has no policy; evaluate it instead of acting with it"
+        )
     if spec.kind == "learned":
         from tslam_bench.baselines.learned import LearnedBaseline  # torch and stable-baselines3 load here only
 

@@ -76,7 +76,9 @@ class Rollout:
                     float(data["episode_return"]),
                 )
         except Exception as error:  # damaged archives fail in zipfile, zlib or numpy
-            raise InvalidInputError(f"{path}: is not a stored episode ({type(error).__name__}); delete it and run again") from error
+            raise InvalidInputError(
+                f"{path}: is not a stored episode ({type(error).__name__}); delete it and run again"
+            ) from error
         if rollout.actions.shape != (HORIZON, NUM_JOINTS) or rollout.touched_step.shape != _GRID_SHAPE:
             raise InvalidInputError(f"{path}: arrays of the wrong shape; delete it and run again")
         return rollout
@@ -85,19 +87,19 @@ class Rollout:
 def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed: int) -> Rollout:
     """Lets ``baseline`` explore ``object_name`` in ``pose`` for one episode.
 
-    The environment starts from ``episode_seed(object_name, pose, seed)``, and so does the baseline: equal arguments give equal
-    episodes, bit for bit on one machine.
+    The environment starts from ``episode_seed(object_name, pose, seed)``, and so does the baseline: equal arguments
+    give equal episodes, bit for bit on one machine.
 
     Args:
-        env: a ``TactileSLAM`` environment with one sub-environment, flat dict observations and an undrawn object and pose.
+        env: a ``TactileSLAM`` environment with one sub-environment and flat dict observations.
         baseline: the policy; it is reset here.
         object_name: a prepared object of the environment's split.
         pose: 0..7.
         seed: repetition.
 
     Raises:
-        InvalidInputError: unknown object or pose, an environment of several sub-environments, or an episode that does not
-            end after 200 steps.
+        InvalidInputError: unknown object or pose, an environment of several sub-environments, or an episode that does
+            not end after 200 steps.
     """
     pose = check_pose(pose)
     if getattr(env.unwrapped, "num_envs", 1) != 1:

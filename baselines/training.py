@@ -1,8 +1,8 @@
 """Trains a learned baseline with stable-baselines3's PPO (protocol section 11).
 
-A run is cut into chunks of ``checkpoint_every`` steps. Each chunk starts from a checkpoint, with freshly reset environments and
-random numbers seeded from (seed, steps so far): a run that was killed and resumed ends with the same weights, bit for bit, as
-one that was not.
+A run is cut into chunks of ``checkpoint_every`` steps. Each chunk starts from a checkpoint, with freshly reset
+environments and random numbers seeded from (seed, steps so far): a run that was killed and resumed ends with the same
+weights, bit for bit, as one that was not.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class TrainingConfig:
     baseline: str
     """Id of a learned baseline; it decides the reward."""
     steps: int = PAPER_STEPS
-    """Environment steps in all, over all environments; rounded up to whole PPO iterations (num_envs * rollout_steps)."""
+    """Environment steps over all environments; rounded up to whole PPO iterations (num_envs * rollout_steps)."""
     seed: int = 0
     """Seeds weights, exploration, minibatches, and the objects and poses that are drawn."""
     num_envs: int = 8
@@ -119,8 +119,8 @@ def train(
 ) -> dict[str, Any]:
     """Trains, or goes on with, the run in ``output``; a finished one is left as it is.
 
-    Writes ``model.zip`` (stable-baselines3), ``model.json`` (the returned metadata), ``tensorboard/`` and, while it runs,
-    ``checkpoints/<steps>/``.
+    Writes ``model.zip`` (stable-baselines3), ``model.json`` (the returned metadata), ``tensorboard/`` and, while it
+    runs, ``checkpoints/<steps>/``.
 
     Args:
         config: settings.
@@ -150,7 +150,11 @@ def train(
 
     environments = make_training_environments(config)
     normalised = VecNormalize(
-        VecMonitor(TactileVecEnv(environments)), norm_obs=False, norm_reward=True, gamma=config.gamma, clip_reward=np.inf
+        VecMonitor(TactileVecEnv(environments)),
+        norm_obs=False,
+        norm_reward=True,
+        gamma=config.gamma,
+        clip_reward=np.inf,
     )
     try:
         if checkpoint is None or state is None:
@@ -188,7 +192,11 @@ def train(
         "seconds": round(seconds, 1),
         "mean_return": mean_return,
         "machine": machine_description(),
-        "versions": {"tslam_bench": tslam_bench.__version__, "torch": str(torch.__version__), "python": platform.python_version()},
+        "versions": {
+            "tslam_bench": tslam_bench.__version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
         "command": command or " ".join(sys.argv),
     }
     with atomic_file(output / MODEL_FILE) as temporary:
@@ -212,7 +220,9 @@ def machine_description() -> dict[str, Any]:
     processor = platform.processor() or platform.machine()
     cpu_info = Path("/proc/cpuinfo")
     if cpu_info.is_file():
-        names = [line.split(":", 1)[1].strip() for line in cpu_info.read_text().splitlines() if line.startswith("model name")]
+        names = [
+            line.split(":", 1)[1].strip() for line in cpu_info.read_text().splitlines() if line.startswith("model name")
+        ]
         processor = names[0] if names else processor
     return {"system": platform.system(), "processor": processor, "cores": os.cpu_count()}
 
@@ -258,7 +268,12 @@ def _learn_chunk(model: PPO, config: TrainingConfig, steps: int, on_progress: Ca
 
 
 def _save_checkpoint(
-    model: PPO, normalised: VecNormalize, config: TrainingConfig, output: Path, seconds: float, mean_return: float | None
+    model: PPO,
+    normalised: VecNormalize,
+    config: TrainingConfig,
+    output: Path,
+    seconds: float,
+    mean_return: float | None,
 ) -> None:
     """Writes ``checkpoints/<steps>/`` atomically, then removes older ones."""
     target = output / "checkpoints" / f"{model.num_timesteps:010d}"
@@ -296,4 +311,6 @@ def _check_same_settings(config: TrainingConfig, found: dict[str, Any], output: 
     different = sorted(key for key in here.keys() | found.keys() if here.get(key) != found.get(key))
     if different:
         pairs = ", ".join(f"{key} {found.get(key)!r} there, {here.get(key)!r} here" for key in different)
-        raise InvalidInputError(f"{output}: holds a run with other settings ({pairs}); choose another output or delete it")
+        raise InvalidInputError(
+            f"{output}: holds a run with other settings ({pairs}); choose another output or delete it"
+        )

@@ -1,11 +1,12 @@
 """Our adapter from batched torch environments to stable-baselines3.
 
-The adapter that ManiSkill ships fails with gymnasium 1.x, hands out reset observations as terminal ones, and reports episode
-returns as arrays.
+The adapter that ManiSkill ships fails with gymnasium 1.x, hands out reset observations as terminal ones, and reports
+episode returns as arrays.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -58,7 +59,7 @@ class TactileVecEnv(VecEnv):
         self.environments = tuple(environments)
         self._sizes = [int(getattr(env.unwrapped, "num_envs", 1)) for env in self.environments]
         starts = np.cumsum([0, *self._sizes])
-        self._slices = [slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(starts)]
         self._owner = [k for k, size in enumerate(self._sizes) for _ in range(size)]
         observation_spaces = [_single_space(env, "observation") for env in self.environments]
         action_spaces = [_single_space(env, "action") for env in self.environments]
@@ -72,7 +73,7 @@ class TactileVecEnv(VecEnv):
         if seed is not None:
             self.seed(seed)
 
-    def reset(self) -> Observation:  # type: ignore[override]
+    def reset(self) -> Observation:
         """Resets every sub-environment; seeds set before are used once. Entries are (num_envs, ...)."""
         parts = []
         for env, part in zip(self.environments, self._slices, strict=True):
@@ -108,10 +109,11 @@ class TactileVecEnv(VecEnv):
             rewards[part] = to_numpy(reward)
             dones[part] = done
             own: list[dict[str, Any]] = [
-                {"TimeLimit.truncated": bool(t and not e)} for t, e in zip(truncated_array, terminated_array, strict=True)
+                {"TimeLimit.truncated": bool(t and not e)}
+                for t, e in zip(truncated_array, terminated_array, strict=True)
             ]
             if done.any():
-                for i in np.flatnonzero(done):
+                for i in np.flatnonzero(done).tolist():
                     own[i].update(_info_of(info, i))
                     own[i]["terminal_observation"] = {key: value[i].copy() for key, value in observation.items()}
                 observation = self._reset_finished(env, part, done, observation)
@@ -126,7 +128,7 @@ class TactileVecEnv(VecEnv):
         else:
             observation, info = env.reset(options={"env_idx": torch.from_numpy(np.flatnonzero(done))})
         first = observation_to_numpy(observation)
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             self.reset_infos[part.start + i] = _info_of(info, i)
         for key, value in last.items():
             value[done] = first[key][done]
@@ -146,11 +148,14 @@ class TactileVecEnv(VecEnv):
         for k in sorted({self._owner[i] for i in self._get_indices(indices)}):
             self.environments[k].set_wrapper_attr(attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
-        """Calls a method once on each environment that the sub-environments belong to; one result per sub-environment."""
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method once per environment that is concerned; returns one result per sub-environment."""
         owners = [self._owner[i] for i in self._get_indices(indices)]
         results = {
-            k: self.environments[k].get_wrapper_attr(method_name)(*method_args, **method_kwargs) for k in sorted(set(owners))
+            k: self.environments[k].get_wrapper_attr(method_name)(*method_args, **method_kwargs)
+            for k in sorted(set(owners))
         }
         return [results[k] for k in owners]
 

@@ -1,4 +1,4 @@
-"""The stable-baselines3 adapter's contract, on a small batched environment whose every observation says where it comes from."""
+"""The adapter to stable-baselines3, on a small batched environment whose observations say where they come from."""
 
 from __future__ import annotations
 
@@ -132,7 +132,9 @@ def test_kinds() -> None:
             "occupancy": np.uint8,
             "touch": np.uint8,
         }
-        assert all(value.shape[0] == 2 and vec.observation_space[key].contains(value[0]) for key, value in observation.items())
+        assert all(
+            value.shape[0] == 2 and vec.observation_space[key].contains(value[0]) for key, value in observation.items()
+        )
         observation, rewards, dones, _ = act(vec)
     assert rewards.dtype == np.float32 and rewards.shape == (2,)
     assert dones.dtype == np.bool_ and isinstance(rewards, np.ndarray)

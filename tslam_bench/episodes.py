@@ -1,4 +1,4 @@
-"""The seed of an evaluation episode (protocol section 12); free of torch and simulators, so that scoring can read it."""
+"""The seed of an evaluation episode (protocol section 12). Needs no simulator: scoring reads it too."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Shape metrics as small pure functions (protocol section 10).
 
 Every distance is in metric units: 1 is the workspace edge, 0.25 m. Callers divide metres by ``WORKSPACE_EDGE``.
-Definitions follow Mescheder et al. (Occupancy Networks, 2019), whose evaluation the tSLAM paper uses, and Knapitsch et al.
-(Tanks and Temples, 2017) for the F-score. ``docs/metrics.md`` lists the traps.
+Definitions follow Mescheder et al. (Occupancy Networks, 2019), whose evaluation the tSLAM paper uses, and, for the
+F-score, Knapitsch et al. (Tanks and Temples, 2017). ``docs/metrics.md`` lists the traps.
 """
 
 from __future__ import annotations
@@ -84,7 +84,9 @@ class SurfaceMatch:
     nearest_predicted: NDArray[np.int64]
 
 
-def match_surfaces(predicted: NDArray, true: NDArray, true_tree: cKDTree | None = None, workers: int = 1) -> SurfaceMatch:
+def match_surfaces(
+    predicted: NDArray, true: NDArray, true_tree: cKDTree | None = None, workers: int = 1
+) -> SurfaceMatch:
     """Nearest neighbours both ways between samples (P, 3) and (T, 3) in metric units.
 
     Args:
@@ -142,15 +144,15 @@ def f_score(match: SurfaceMatch, distance: float) -> float:
 
 
 def surface_iou(touched: NDArray[np.bool_], surface: NDArray[np.bool_]) -> float:
-    """IoU of touched voxels with the voxels that the true surface crosses, (32, 32, 32) each. Never called IoU alone."""
+    """IoU of touched voxels with voxels that the true surface crosses, (32, 32, 32) each. Never called IoU alone."""
     return iou(touched, surface)
 
 
 class TouchCoverage:
     """Which true surface samples have a touched voxel near, and since when.
 
-    A sample is covered once a voxel whose centre lies within one voxel edge of it is touched. Only the 27 voxels around a
-    sample can be that near, so the candidates are found once per object.
+    A sample is covered once a voxel whose centre lies within one voxel edge of it is touched. Only the 27 voxels around
+    a sample can be that near, so the candidates are found once per object.
     """
 
     def __init__(self, surface_points: NDArray) -> None:
@@ -162,12 +164,12 @@ class TouchCoverage:
             raise ValueError("TouchCoverage: the surface samples must be non-empty and lie inside the workspace")
         offsets = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         near = np.empty((self.count, len(offsets)), dtype=bool)
-        for column, offset in enumerate(offsets):
-            near[:, column] = np.square(home + offset + 0.5 - cells).sum(axis=1) <= 1.0
+        for k, offset in enumerate(offsets):
+            near[:, k] = np.square(home + offset + 0.5 - cells).sum(axis=1) <= 1.0
         sample, column = np.nonzero(near)
         # One layer of padding: a neighbour outside W is never touched.
-        self._padded_size = GRID_SIZE + 2
-        self._voxel = np.ravel_multi_index((home[sample] + offsets[column] + 1).T, (self._padded_size,) * 3)
+        self._padded = (GRID_SIZE + 2,) * 3
+        self._voxel = np.ravel_multi_index(tuple((home[sample] + offsets[column] + 1).T), self._padded)
         # Every sample has at least its own voxel (at most sqrt(3)/2 edges away), so no segment is empty.
         self._start = np.searchsorted(sample, np.arange(self.count))
 
@@ -181,7 +183,7 @@ class TouchCoverage:
             (T,) steps; the largest int64 for samples never covered.
         """
         never = np.iinfo(np.int64).max
-        steps = np.full((self._padded_size,) * 3, never, dtype=np.int64)
+        steps = np.full(self._padded, never, dtype=np.int64)
         steps[1:-1, 1:-1, 1:-1] = np.where(touched_step >= 0, touched_step, never)
         return np.minimum.reduceat(steps.reshape(-1)[self._voxel], self._start)
 
@@ -219,7 +221,7 @@ def area_under_curve(values: NDArray) -> float:
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"area_under_curve: shape {values.shape}, expected at least two values in one dimension")
-    return float(np.trapezoid(values) if hasattr(np, "trapezoid") else np.trapz(values)) / (len(values) - 1)
+    return float(np.mean(values[1:] + values[:-1])) / 2
 
 
 def to_metric(metres: NDArray) -> NDArray[np.float64]:

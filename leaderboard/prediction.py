@@ -63,7 +63,9 @@ def solid_in_mesh(mesh: trimesh.Trimesh, points: NDArray) -> NDArray[np.bool_]:
     return solid
 
 
-def prepare(reconstruction: Volume | trimesh.Trimesh | None, points: NDArray, samples: int = SURFACE_SAMPLES) -> Prediction:
+def prepare(
+    reconstruction: Volume | trimesh.Trimesh | None, points: NDArray, samples: int = SURFACE_SAMPLES
+) -> Prediction:
     """Evaluates a reconstruction at ``points`` (M, 3) m and samples its surface.
 
     A missing, empty or invalid reconstruction gives an empty prediction with its reason; nothing is dropped.

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import igl
 import numpy as np
 import trimesh
@@ -29,7 +31,7 @@ def crossed_voxels(mesh: trimesh.Trimesh) -> np.ndarray:
 def prepare_primitive(
     mesh: trimesh.Trimesh, hulls: list[trimesh.Trimesh], name: str = "primitive", spacing: float = 2e-3
 ) -> PreparedObject:
-    """PreparedObject of a watertight ``mesh`` that is the union of convex ``hulls`` (metres, centred on its bounding box)."""
+    """PreparedObject of a watertight ``mesh``, the union of convex ``hulls`` (m, centred on its bounding box)."""
     vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     generator = np.random.default_rng(0)
     points, face = trimesh.sample.sample_surface(mesh, SURFACE_SAMPLES, seed=generator)
@@ -77,7 +79,9 @@ def prepared_sphere(radius: float = 0.05, name: str = "sphere") -> PreparedObjec
     return prepare_primitive(mesh, [mesh], name)
 
 
-def prepared_torus(major: float = 0.045, minor: float = 0.018, name: str = "torus", sectors: int = 32) -> PreparedObject:
+def prepared_torus(
+    major: float = 0.045, minor: float = 0.018, name: str = "torus", sectors: int = 32
+) -> PreparedObject:
     """A torus about z: circle of radius ``minor`` (m) swept on a circle of radius ``major`` (m).
 
     Its hulls are its sectors, which are convex: the prisms between neighbouring sections.
@@ -87,7 +91,7 @@ def prepared_torus(major: float = 0.045, minor: float = 0.018, name: str = "toru
     section = 2 * np.pi * np.arange(24) / 24
     ring = np.stack([major + minor * np.cos(section), np.zeros(24), minor * np.sin(section)], axis=1)
     rings = [trimesh.transform_points(ring, trimesh.transformations.rotation_matrix(t, [0, 0, 1])) for t in turns]
-    hulls = [trimesh.convex.convex_hull(np.concatenate(pair)) for pair in zip(rings[:-1], rings[1:], strict=True)]
+    hulls = [trimesh.convex.convex_hull(np.concatenate(pair)) for pair in itertools.pairwise(rings)]
     return prepare_primitive(mesh, hulls, name, spacing=3e-3)
 
 

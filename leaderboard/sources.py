@@ -1,0 +1,172 @@
+"""Reading a submission's files from a folder or a zip archive without trusting either.
+
+Nothing is ever extracted. Names are checked before anything is opened, sizes before anything is read.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Final
+
+from tslam_bench.errors import InvalidInputError
+
+MAX_FILES: Final = 20_000
+"""Files in a submission."""
+MAX_FILE_SIZE: Final = 64 * 2**20
+"""Bytes of one uncompressed file: 64 MiB."""
+MAX_TOTAL_SIZE: Final = 8 * 2**30
+"""Bytes of all uncompressed files: 8 GiB."""
+MAX_COMPRESSION_RATIO: Final = 100
+"""Uncompressed to compressed bytes of a zip entry above ``RATIO_FREE_SIZE``."""
+RATIO_FREE_SIZE: Final = 2**20
+"""Bytes below which the compression ratio of an entry is not looked at: 1 MiB."""
+
+_IGNORED_NAMES = ("readme", "readme.md", "readme.txt", "license", "license.txt", "license.md")
+
+
+class FileSource:
+    """Names and bytes of the regular files of a submission.
+
+    Attributes:
+        location: the path as given, for messages.
+        sizes: name with forward slashes, relative to the submission -> uncompressed bytes. Hidden files, ``__MACOSX``
+            and a README or LICENSE at the top are left out.
+    """
+
+    def __init__(self, location: str, sizes: dict[str, int]) -> None:
+        self.location = location
+        if len(sizes) > MAX_FILES:
+            raise InvalidInputError(f"{location}: {len(sizes)} files; at most {MAX_FILES} are read")
+        for name, size in sizes.items():
+            if size > MAX_FILE_SIZE:
+                raise InvalidInputError(f"{location}: {name} has {size} bytes; at most {MAX_FILE_SIZE} are read")
+        total = sum(sizes.values())
+        if total > MAX_TOTAL_SIZE:
+            raise InvalidInputError(f"{location}: {total} bytes uncompressed; at most {MAX_TOTAL_SIZE} are read")
+        self.sizes = {name: size for name, size in sizes.items() if not _ignored(name)}
+
+    def read(self, name: str) -> bytes:
+        """Bytes of one listed file."""
+        raise NotImplementedError
+
+
+class FolderSource(FileSource):
+    """A submission in a folder. Symbolic links and special files are refused, not followed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        sizes: dict[str, int] = {}
+        pending = [folder]
+        while pending:
+            try:
+                entries = sorted(os.scandir(pending.pop()), key=lambda entry: entry.name)
+            except OSError as error:
+                raise InvalidInputError(f"{folder}: cannot be read ({error.strerror})") from error
+            for entry in entries:
+                name = Path(entry.path).relative_to(folder).as_posix()
+                mode = entry.stat(follow_symlinks=False).st_mode
+                if stat.S_ISDIR(mode):
+                    pending.append(Path(entry.path))
+                elif stat.S_ISREG(mode):
+                    sizes[name] = entry.stat(follow_symlinks=False).st_size
+                else:
+                    kind = "a symbolic link" if stat.S_ISLNK(mode) else "not a regular file"
+                    raise InvalidInputError(f"{folder}: {_shown(name)} is {kind}; replace it with the file itself")
+                if len(sizes) + len(pending) > 2 * MAX_FILES:
+                    raise InvalidInputError(f"{folder}: more than {MAX_FILES} files; is this a submission folder?")
+        super().__init__(str(folder), sizes)
+
+    def read(self, name: str) -> bytes:
+        """Bytes of one listed file."""
+        try:
+            with (self._folder / name).open("rb") as stream:
+                return stream.read(MAX_FILE_SIZE + 1)
+        except OSError as error:
+            raise InvalidInputError(f"{self.location}: {name} cannot be read ({error.strerror})") from error
+
+
+class ZipSource(FileSource):
+    """A submission in a zip archive: its files at the top, or in one folder at the top."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._archive = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise InvalidInputError(f"{path}: not a readable zip archive ({error}); pack it again") from error
+        entries: dict[str, zipfile.ZipInfo] = {}
+        for entry in self._archive.infolist():
+            if not entry.is_dir():
+                _check_entry(str(path), entry)
+                if entry.filename in entries:
+                    raise InvalidInputError(f"{path}: {entry.filename} is in the archive twice; pack it again")
+                entries[entry.filename] = entry
+        prefix = _common_folder([name for name in entries if not name.startswith("__MACOSX/")])
+        self._entries = {name.removeprefix(prefix): entry for name, entry in entries.items()}
+        super().__init__(str(path), {name: entry.file_size for name, entry in self._entries.items()})
+
+    def read(self, name: str) -> bytes:
+        """Bytes of one listed file; zipfile stops at the declared size and checks the CRC."""
+        try:
+            return self._archive.read(self._entries[name])
+        except (OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+            raise InvalidInputError(f"{self.location}: {name} is damaged ({error}); pack it again") from error
+
+
+def open_source(path: Path) -> FileSource:
+    """Opens a folder or a zip archive.
+
+    Raises:
+        InvalidInputError: it does not exist, is neither, holds links or unsafe names, or exceeds a limit.
+    """
+    if path.is_dir():
+        return FolderSource(path)
+    if not path.exists():
+        raise InvalidInputError(f"{path}: no such folder or zip archive; check the path")
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        raise InvalidInputError(f"{path}: neither a folder nor a zip archive; give one that holds submission.json")
+    return ZipSource(path)
+
+
+def _check_entry(location: str, entry: zipfile.ZipInfo) -> None:
+    name = _shown(entry.filename)
+    parts = entry.filename.split("/")
+    if (
+        any(part in ("", ".", "..") for part in parts)
+        or "\\" in entry.filename
+        or ":" in entry.filename
+        or not entry.filename.isprintable()
+        or "\0" in entry.orig_filename
+    ):
+        raise InvalidInputError(f"{location}: the entry {name} leaves the archive; pack it again with relative names")
+    mode = entry.external_attr >> 16
+    if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
+        raise InvalidInputError(f"{location}: {name} is a link or special file; replace it with the file itself")
+    if entry.flag_bits & 0x1:
+        raise InvalidInputError(f"{location}: {name} is encrypted; pack it without a password")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InvalidInputError(f"{location}: {name} uses an unusual compression; pack it with deflate")
+    if entry.file_size > RATIO_FREE_SIZE and entry.file_size > MAX_COMPRESSION_RATIO * max(entry.compress_size, 1):
+        raise InvalidInputError(
+            f"{location}: {name} unpacks to more than {MAX_COMPRESSION_RATIO} times its size; refused"
+        )
+
+
+def _common_folder(names: list[str]) -> str:
+    """``"folder/"`` if all names are in one folder and submission.json is directly in it, else ``""``."""
+    folders = {name.partition("/")[0] for name in names}
+    if len(folders) == 1 and f"{next(iter(folders))}/submission.json" in names:
+        return f"{folders.pop()}/"
+    return ""
+
+
+def _ignored(name: str) -> bool:
+    parts = name.split("/")
+    return parts[0] == "__MACOSX" or any(part.startswith(".") for part in parts) or name.lower() in _IGNORED_NAMES
+
+
+def _shown(name: str) -> str:
+    return repr(name[:100])

@@ -1,1 +1,1 @@
-"""See docs/architecture.md."""
+"""The tactile exploration tasks: hand, sensing, rewards, ManiSkill environments."""

@@ -47,6 +47,10 @@ class NumpyBackend(Backend):
         """As int16."""
         return value.astype(np.int16)
 
+    def clip(self, value: np.ndarray, low: float, high: Any) -> np.ndarray:
+        """Elementwise clip; ``high`` may be an array."""
+        return np.minimum(np.maximum(value, low), high)
+
     def take(self, flat: np.ndarray, index: np.ndarray) -> np.ndarray:
         """``flat[index]`` for a one-dimensional array."""
         return flat.take(index)
@@ -105,6 +109,10 @@ class TorchBackend(Backend):
     def int16(self, value: Array) -> Array:
         """As int16."""
         return value.to(self.module.int16)
+
+    def clip(self, value: Array, low: float, high: Any) -> Array:
+        """Elementwise clip; ``high`` may be a tensor."""
+        return self.module.clamp(self.module.clamp(value, min=low), max=high)
 
     def take(self, flat: Array, index: Array) -> Array:
         """``flat[index]`` for a one-dimensional tensor."""

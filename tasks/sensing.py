@@ -189,12 +189,16 @@ class TactileSensing:
             The step's contacts.
         """
         components = link_matrices.reshape(self.num_envs, self._num_links, 12)
-        on, values = self._touch(components)
+        on, probe_cells = self._touch(components)
         new = on & ~self._on
         self._on = on
-        new_touched, points, mask = self._touch_voxels(components, on, new, values, step)
+        new_touched, points, mask = self._touch_voxels(on, new, probe_cells, step)
         new_visited = self._visit_voxels(components)
         return Contacts(on, new, points, mask, new_touched, new_visited)
+
+    def touches(self, link_matrices: Array) -> Array:
+        """(E, P) bool, probes that would be on for these link poses; changes nothing."""
+        return self._touch(link_matrices.reshape(self.num_envs, self._num_links, 12))[0]
 
     def link_touch(self) -> Array:
         """(E, L) bool: a link's touch bit is on when any of its probes is."""
@@ -202,14 +206,14 @@ class TactileSensing:
             return np.logical_or.reduceat(self._on, self._first_probe, axis=1)
         return (self._on.to(self._link_of_probe.dtype) @ self._link_of_probe) > 0  # 0/1 sums: exact
 
-    def _touch(self, components: Array) -> tuple[Array, Array]:
-        """(E, P) probes on, and what the contact points need: object-frame cells of the probes."""
+    def _touch(self, components: Array) -> tuple[Array, list[Array]]:
+        """(E, P) probes on, and three (E, P) arrays of probe positions in field cells, for the contact points."""
         xp = self._xp
         local = self._to_object_frame(components)
         u = [(p - o) * self._inverse_spacing for p, o in zip(self._probes.place(local), self._origin, strict=True)]
         nearest = self._offset
         for axis in range(3):
-            cell = xp.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
+            cell = self.backend.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
             nearest = nearest + self.backend.integer(cell) * self._stride[axis]
         near = self.backend.take(self.atlas.values, nearest) <= self._probe_reach + self._cull_margin
         rows, columns = self.backend.select(near)
@@ -220,7 +224,7 @@ class TactileSensing:
         return on, u
 
     def _touch_voxels(
-        self, components: Array, on: Array, new: Array, u: list[Array], step: Array
+        self, on: Array, new: Array, u: list[Array], step: Array
     ) -> tuple[Array, Array, Array]:
         backend, xp = self.backend, self._xp
         rows, columns = backend.select(on)
@@ -333,8 +337,8 @@ class _Cells:
         index, fraction = sensing._offset[rows, 0], []
         strides = []
         for axis in range(3):
-            low = xp.clip(xp.floor(u[axis]), 0.0, sensing._last_cell[axis][rows, 0])
-            fraction.append(xp.clip(u[axis] - low, 0.0, 1.0))
+            low = backend.clip(xp.floor(u[axis]), 0.0, sensing._last_cell[axis][rows, 0])
+            fraction.append(backend.clip(u[axis] - low, 0.0, 1.0))
             strides.append(sensing._stride[axis][rows, 0])
             index = index + backend.integer(low) * strides[axis]
         self._xp, self._fraction = xp, fraction

@@ -50,7 +50,7 @@ class SimulatedTouches:
 
 _BATCH = 48  # contacts tried at a time
 _MAX_CONTACTS = 600
-_STEP = 0.006  # between samples along strokes and fingers (m), below the voxel edge
+_STEP = 0.007  # between samples along strokes and fingers (m), below the voxel edge
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -64,8 +64,8 @@ def _frames(directions: NDArray[np.float64], generator: np.random.Generator) -> 
 
 
 def _palm_samples(simulation: TouchSimulation) -> NDArray[np.float64]:
-    """Points (K, 3) in the palm's box, about 1 cm apart, the third axis its thickness."""
-    axes = [np.linspace(-size / 2, size / 2, max(2, round(size / 0.01) + 1)) for size in simulation.palm]
+    """Points (K, 3) in the palm's box, at most 1.25 cm apart, the third axis its thickness."""
+    axes = [np.linspace(-size / 2, size / 2, int(np.ceil(size / 0.0125)) + 1) for size in simulation.palm]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -85,13 +85,15 @@ def _stroke(placed: PlacedShape, direction: NDArray, simulation: TouchSimulation
     return points[:stop].reshape(-1, 3)
 
 
-def _fingers(simulation: TouchSimulation) -> NDArray[np.float64]:
-    """Points (steps, 7, 3) of a finger along +z with its tip's centre at the origin: the axis and a ring about it."""
-    along = np.arange(0, simulation.finger_length, _STEP)
+def _finger_samples(simulation: TouchSimulation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A finger along +z whose tip is a ball about the origin: its axis (A, 3), and points on its skin (K, 3)."""
+    along = np.arange(0, simulation.finger_length, _STEP)[:, None] * np.array([0.0, 0.0, 1.0])
     angle = np.arange(6) * np.pi / 3
-    radius = 0.85 * simulation.finger_radius
-    ring = np.concatenate([np.zeros((1, 3)), radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)])
-    return ring + along[:, None, None] * np.array([0.0, 0.0, 1.0])
+    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    pole = np.array([0.0, 0.0, -1.0])
+    tip = np.concatenate([pole[None], 0.87 * around + 0.5 * pole, 0.5 * around + 0.87 * pole])
+    skin = np.concatenate([tip, (along[:, None] / simulation.finger_radius + around).reshape(-1, 3)])
+    return along, simulation.finger_radius * skin
 
 
 def simulate_touches(
@@ -109,7 +111,7 @@ def simulate_touches(
             swept.append(_stroke(placed, direction, simulation, generator))
 
     surface, normals = placed.surface()
-    finger = _fingers(simulation)
+    axis, skin = _finger_samples(simulation)
     touched = np.zeros((grids.GRID_SIZE,) * 3, dtype=bool)
     contacts = [np.zeros((0, 3))]
     tried = 0
@@ -120,10 +122,11 @@ def simulate_touches(
         point, normal = surface[candidates], normals[candidates]
         pointing = _unit(normal + 0.8 * direction + 0.4 * generator.standard_normal(normal.shape))
         tips = point + (simulation.finger_radius + 0.0005) * normal
-        bodies = tips[:, None, None] + finger @ _frames(pointing, generator)[:, None]  # (M, steps, 7, 3)
+        frames = _frames(pointing, generator)
+        bodies = tips[:, None] + np.concatenate([axis, skin]) @ frames  # (M, A + K, 3)
         inside = placed.inside(bodies)
-        # The lookup is coarser than the gap at the tip: a finger is blocked when its axis is.
-        reachable = ((normal * direction).sum(axis=1) > -0.3) & ~inside[:, :, 0].any(axis=1)
+        # The lookup is coarser than the gap under the tip, so skin points may seem inside: the axis decides.
+        reachable = ((normal * direction).sum(axis=1) > -0.3) & ~inside[:, : len(axis)].any(axis=1)
         for index in np.flatnonzero(reachable):
             swept.append(bodies[index][~inside[index]])
             radius = generator.uniform(*simulation.patch_radius)

@@ -1,0 +1,75 @@
+"""From actions to drive targets (protocol section 2), batched over environments, on numpy or torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import (
+    CONTROL_MODES,
+    COUPLED_JOINTS,
+    COUPLING_END,
+    COUPLING_MIDDLE,
+    COUPLING_SLACK,
+    DELTA_STEP,
+    JOINT_LIMITS,
+    JOINT_NAMES,
+)
+from tslam_bench.tasks.arrays import Backend
+
+Array = Any
+
+MIDDLE = np.array([JOINT_NAMES.index(middle) for middle, _ in COUPLED_JOINTS])
+END = np.array([JOINT_NAMES.index(end) for _, end in COUPLED_JOINTS])
+
+
+class DriveTargets:
+    """Computes the 28 drive targets of E hands.
+
+    Args:
+        mode: ``pd_joint_delta_pos`` or ``pd_joint_pos``.
+        backend: numpy or torch.
+
+    Raises:
+        InvalidInputError: unknown mode.
+    """
+
+    def __init__(self, mode: str, backend: Backend) -> None:
+        if mode not in CONTROL_MODES:
+            raise InvalidInputError(f"control_mode {mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
+        self.mode = mode
+        self._backend = backend
+        limits = JOINT_LIMITS.astype(np.float32)
+        self._low, self._high = backend.array(limits[:, 0]), backend.array(limits[:, 1])
+        self._half_range = backend.array((limits[:, 1] - limits[:, 0]) / 2)
+        self._middle_range = backend.array((limits[:, 1] + limits[:, 0]) / 2)
+        self._delta = backend.array(DELTA_STEP.astype(np.float32))
+
+    def __call__(self, action: Array, qpos: Array) -> Array:
+        """Targets (E, 28) for actions (E, 28), clipped to [-1, 1], at joint positions (E, 28); m and rad."""
+        clip = self._backend.clip
+        action = clip(action, -1.0, 1.0)
+        if self.mode == "pd_joint_delta_pos":
+            target = qpos + action * self._delta
+        else:
+            target = self._middle_range + action * self._half_range
+        target = self._clip_to_limits(target)
+        return self._clip_to_limits(couple(target, self._backend))
+
+    def _clip_to_limits(self, target: Array) -> Array:
+        xp = self._backend.module
+        return xp.minimum(xp.maximum(target, self._low), self._high)
+
+
+def couple(target: Array, backend: Backend) -> Array:
+    """Projects each finger's middle and end joint onto what its tendon allows: the nearest point of the band."""
+    middle, end = target[:, MIDDLE], target[:, END]
+    stretch = COUPLING_END * end - COUPLING_MIDDLE * middle
+    excess = stretch - backend.clip(stretch, -COUPLING_SLACK, COUPLING_SLACK)
+    scale = 1.0 / (COUPLING_END**2 + COUPLING_MIDDLE**2)
+    coupled = target.copy() if backend.is_numpy else target.clone()
+    coupled[:, MIDDLE] = middle + (COUPLING_MIDDLE * scale) * excess
+    coupled[:, END] = end - (COUPLING_END * scale) * excess
+    return coupled

@@ -1,0 +1,94 @@
+"""PhysX settings and bodies: everything that decides the physics, in one place (protocol sections 2 to 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import sapien
+from sapien import physx
+
+from tslam_bench import grids
+from tslam_bench.assets.store import PreparedObject
+from tslam_bench.errors import AssetError
+
+SOLVER_POSITION_ITERATIONS: Final = 4
+SOLVER_VELOCITY_ITERATIONS: Final = 1
+CONTACT_OFFSET: Final = 2e-3
+REST_OFFSET: Final = 0.0
+STATIC_FRICTION: Final = 1.0
+DYNAMIC_FRICTION: Final = 1.0
+RESTITUTION: Final = 0.0
+COOKING_SCALE: Final = 100.0
+"""Hulls are cooked in centimetres and scaled back: PhysX's plane tolerance is 0.7 mm and eats small hulls cooked in metres."""
+
+
+def pose_quaternion(pose: int) -> np.ndarray:
+    """(4,) unit quaternion (w, x, y, z) of a pose of protocol section 3."""
+    half_yaw = np.deg2rad(90 * (grids.check_pose(pose) % 4)) / 2
+    yaw = np.array([np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)])
+    if pose < 4:
+        return yaw
+    w, z = yaw[0], yaw[3]
+    return np.array([0.0, w, z, 0.0])  # yaw * (0, 1, 0, 0)
+
+
+def collision_shapes(prepared: PreparedObject) -> list[physx.PhysxCollisionShapeConvexMesh]:
+    """Cooks an object's hulls.
+
+    Raises:
+        AssetError: PhysX cannot cook a hull.
+    """
+    material = physx.PhysxMaterial(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
+    shapes = []
+    for index, (vertices, _) in enumerate(prepared.hulls):
+        try:
+            shape = physx.PhysxCollisionShapeConvexMesh(
+                vertices=np.asarray(vertices * COOKING_SCALE, dtype=np.float32),
+                scale=[1 / COOKING_SCALE] * 3,
+                material=material,
+            )
+        except RuntimeError as error:
+            raise AssetError(
+                f"{prepared.name}: PhysX cannot cook hull {index} ({error}); "
+                f"rebuild it with 'tslam-bench assets prepare --objects {prepared.name}'"
+            ) from error
+        shapes.append(shape)
+    return shapes
+
+
+def object_entity(prepared: PreparedObject, name: str, shapes: Sequence[Any], can_render: bool) -> sapien.Entity:
+    """A fixed body with the object's hulls, and its true mesh as its looks where rendering is possible."""
+    entity = sapien.Entity()
+    entity.name = name
+    body = physx.PhysxRigidDynamicComponent()
+    body.kinematic = True  # fixed in the world; kinematic rather than static so that a GPU scene can turn it between episodes
+    for shape in shapes:
+        body.attach(shape)
+    if len(body.collision_shapes) != len(prepared.hulls):
+        raise AssetError(f"{prepared.name}: {len(body.collision_shapes)} of {len(prepared.hulls)} hulls reached PhysX")
+    if can_render:
+        entity.add_component(_looks(prepared))
+    entity.add_component(body)
+    return entity
+
+
+def _looks(prepared: PreparedObject) -> Any:
+    material = sapien.render.RenderMaterial(base_color=[0.90, 0.56, 0.25, 1.0], roughness=0.6, specular=0.3)
+    corners = np.asarray(prepared.vertices[prepared.faces].reshape(-1, 3), dtype=np.float32)
+    triangles = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    edges = corners.reshape(-1, 3, 3)
+    normal = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    component = sapien.render.RenderBodyComponent()
+    component.attach(
+        sapien.render.RenderShapeTriangleMesh(
+            corners,
+            triangles,
+            np.repeat(normal, 3, axis=0).astype(np.float32),
+            np.zeros((len(corners), 2), dtype=np.float32),
+            material,
+        )
+    )
+    return component

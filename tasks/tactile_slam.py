@@ -1,0 +1,463 @@
+"""``TactileSLAM-v0``: a blind hand explores an unknown object (protocol sections 1 to 7), as a ManiSkill task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from gymnasium import spaces
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.registration import register
+from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs.pose import Pose
+from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+from sapien import physx
+
+from tslam_bench import grids
+from tslam_bench.assets.hand import load_hand
+from tslam_bench.assets.store import PreparedObject, list_objects, load_object
+from tslam_bench.constants import (
+    ENVIRONMENT_ID,
+    GRID_SIZE,
+    HORIZON,
+    NUM_JOINTS,
+    NUM_POSES,
+    PHYSICS_FREQUENCY,
+    REWARD_MODES,
+    SUBSTEPS,
+)
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.hand_constants import (
+    CONTROL_MODES,
+    JOINT_LIMITS,
+    JOINT_NAMES,
+    SKIN_LINKS,
+    START_ARM_HIGH,
+    START_ARM_LOW,
+    START_FINGER_NOISE,
+)
+from tslam_bench.tasks import physics
+from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
+from tslam_bench.tasks.hand_agent import AdroitHand
+from tslam_bench.tasks.rendering import vulkan_device_available
+from tslam_bench.tasks.rewards import SURFACE_SUBSAMPLE, Rewards
+from tslam_bench.tasks.sensing import Contacts, TactileSensing
+from tslam_bench.tasks.skin import build_skin
+
+_OPEN_QPOS = np.clip(0.0, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+
+
+
+class TactileSLAMEnv(BaseEnv):
+    """A blind 28-DoF hand with binary touch explores a fixed, unknown object for 200 steps (6 s).
+
+    **Description.** The object hangs at the workspace centre, a cube W of edge 0.25 m, and does not move. The hand
+    starts open above it and never sees it: it feels which skin links touch, and forward kinematics tells where. Touched
+    voxels of W, and voxels the hand passed through, accumulate in two 32^3 grids. The task is to touch as much new
+    surface as possible; a reconstructor then completes the shape.
+
+    **Actions.** ``Box(-1, 1, (28,), float32)``, one number per joint of ``tslam_bench.hand_constants.JOINT_NAMES``.
+    ``control_mode="pd_joint_delta_pos"`` (default) moves each target by up to ``DELTA_STEP`` from the current position;
+    ``"pd_joint_pos"`` maps [-1, 1] to the joint limits.
+
+    **Observations** (a dict of batched tensors, E environments): ``qpos`` (E, 28) and ``qvel`` (E, 28) in m, rad and per
+    second; ``touch`` (E, 17) 0/1 per skin link; ``occupancy`` (E, 2, 32, 32, 32) 0/1, channel 0 touched and channel 1
+    visited since the episode began; ``time`` (E, 1) elapsed fraction. ``obs_mode="state"`` flattens them.
+
+    **Rewards.** ``reward_mode`` is one of ``tslam_bench.constants.REWARD_MODES`` (section 7), or ``"none"``.
+
+    **Starting state.** Arm uniform in ``START_ARM_LOW..HIGH`` above W, fingers open with small noise, nothing touched.
+
+    **Episode end.** Truncated at step 200, never terminated.
+
+    Args:
+        object: name of one object for every episode; None draws one per episode.
+        objects: names to draw from; None means the whole split.
+        split: ``test``, ``train``, ``val``, or the name of a private split.
+        pose: 0..7 for every episode (section 3); None draws one per episode.
+        num_envs: environments; more than one needs a GPU.
+        reward_mode, control_mode, obs_mode, render_mode: as above and in ManiSkill.
+        render_backend: ``"auto"`` renders only if ``render_mode`` or images are asked for and a Vulkan device is there.
+        **kwargs: passed on to ManiSkill's ``BaseEnv``.
+
+    ``reset(options={"object": name, "pose": k})`` overrides object and pose for one episode (lists for several
+    environments).
+
+    Raises:
+        InvalidInputError: unknown object, split, pose, reward mode or control mode; an action of wrong shape or not finite.
+        AssetError: an object or the hand is not prepared.
+
+    **Version history.** v0: first version, protocol 1.
+    """
+
+    SUPPORTED_ROBOTS = ["adroit28"]
+    SUPPORTED_OBS_MODES = ("state_dict", "state", "none", "sensor_data", "any_textures", "pointcloud")
+    SUPPORTED_REWARD_MODES = (*REWARD_MODES, "none")
+    agent: AdroitHand
+
+    def __init__(
+        self,
+        *args: Any,
+        object: str | None = None,
+        objects: Sequence[str] | None = None,
+        split: str = "test",
+        pose: int | None = None,
+        num_envs: int = 1,
+        obs_mode: str = "state_dict",
+        reward_mode: str = "tslam",
+        control_mode: str = CONTROL_MODES[0],
+        render_mode: str | None = None,
+        render_backend: str = "auto",
+        robot_uids: str = "adroit28",
+        **kwargs: Any,
+    ) -> None:
+        if reward_mode not in self.SUPPORTED_REWARD_MODES:
+            raise InvalidInputError(
+                f"reward_mode {reward_mode!r}: unknown; choose one of {', '.join(self.SUPPORTED_REWARD_MODES)}"
+            )
+        if control_mode not in CONTROL_MODES:
+            raise InvalidInputError(f"control_mode {control_mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise InvalidInputError(f"num_envs {num_envs!r}: must be a whole number of at least 1")
+        if object is not None and objects is not None:
+            raise InvalidInputError("object and objects: give one or the other, not both")
+        self.split = split
+        self._pose = None if pose is None else grids.check_pose(pose)
+        self._prepared: dict[str, PreparedObject] = {}
+        names = [object] if object is not None else list(objects) if objects is not None else None
+        if names is None:
+            names = [record["name"] for record in list_objects(split)]
+        if not names:
+            raise InvalidInputError(f"split {split!r}: no prepared objects; run 'tslam-bench assets prepare --split {split}'")
+        self._object_names = tuple(self._load(name).name for name in names) if len(names) == 1 else tuple(names)
+        self.object_name: list[str] = [""] * num_envs
+        self.pose: list[int] = [0] * num_envs
+        self._bodies: dict[str, sapien.Entity] = {}
+        self._contacts: Contacts | None = None
+        if render_backend == "auto":
+            wants_images = render_mode is not None or obs_mode not in ("state_dict", "state", "none")
+            render_backend = "gpu" if wants_images and vulkan_device_available() else "none"
+        super().__init__(
+            *args,
+            num_envs=num_envs,
+            obs_mode=obs_mode,
+            reward_mode=reward_mode,
+            control_mode=control_mode,
+            render_mode=render_mode,
+            render_backend=render_backend,
+            robot_uids=robot_uids,
+            **kwargs,
+        )
+
+    # -- configuration ----------------------------------------------------------------------------------------
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(
+            # Whole numbers with the right ratio; the true timestep, 1 / PHYSICS_FREQUENCY, is set in _setup_scene.
+            sim_freq=SUBSTEPS * (PHYSICS_FREQUENCY // SUBSTEPS),
+            control_freq=PHYSICS_FREQUENCY // SUBSTEPS,
+            scene_config=SceneConfig(
+                gravity=np.array([0.0, 0.0, -9.81]),
+                contact_offset=physics.CONTACT_OFFSET,
+                rest_offset=physics.REST_OFFSET,
+                solver_position_iterations=physics.SOLVER_POSITION_ITERATIONS,
+                solver_velocity_iterations=physics.SOLVER_VELOCITY_ITERATIONS,
+                enable_tgs=True,
+            ),
+            default_materials_config=DefaultMaterialsConfig(
+                physics.STATIC_FRICTION, physics.DYNAMIC_FRICTION, physics.RESTITUTION
+            ),
+        )
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        pose = sapien_utils.look_at(eye=[0.42, -0.30, 0.36], target=[0.0, -0.02, 0.02])
+        return CameraConfig("render_camera", pose=pose, width=512, height=512, fov=0.9, near=0.01, far=10.0)
+
+    @property
+    def sim_timestep(self) -> float:
+        """Physics timestep (s)."""
+        return 1.0 / PHYSICS_FREQUENCY
+
+    @property
+    def control_timestep(self) -> float:
+        """Control timestep (s)."""
+        return SUBSTEPS / PHYSICS_FREQUENCY
+
+    @cached_property
+    def single_observation_space(self) -> spaces.Space:
+        """The unbatched observation space."""
+        if self._obs_mode != "state_dict":
+            return super().single_observation_space
+        unbounded = np.full(NUM_JOINTS, np.inf, dtype=np.float32)
+        return spaces.Dict(
+            {
+                "qpos": spaces.Box(-unbounded, unbounded),
+                "qvel": spaces.Box(-unbounded, unbounded),
+                "touch": spaces.Box(0, 1, (len(SKIN_LINKS),), np.uint8),
+                "occupancy": spaces.Box(0, 1, (2, GRID_SIZE, GRID_SIZE, GRID_SIZE), np.uint8),
+                "time": spaces.Box(0.0, 1.0, (1,), np.float32),
+            }
+        )
+
+    # -- scene ------------------------------------------------------------------------------------------------
+    def _setup_scene(self) -> None:
+        super()._setup_scene()
+        self.scene.px.timestep = self.sim_timestep
+        self._bodies = {}
+
+    def _load_agent(self, options: dict) -> None:  # type: ignore[override]
+        super()._load_agent(options, AdroitHand.base_pose())
+
+    def _load_scene(self, options: dict) -> None:
+        self._arrays: Backend = TorchBackend(self.device) if self.gpu_sim_enabled else NumpyBackend()
+        self._sensing = TactileSensing(self.num_envs, build_skin(load_hand().shapes), self._arrays)
+        self._rewards = None
+        if self._reward_mode != "none":
+            self._rewards = Rewards(self._reward_mode, self.num_envs, self._arrays)
+        if self.gpu_sim_enabled:
+            self._load_gpu_objects(options)
+
+    def _load_gpu_objects(self, options: dict) -> None:
+        """One body per sub-scene, fixed until the next reconfigure: a GPU scene cannot gain bodies. Not run on a GPU yet."""
+        entities = []
+        for env in range(self.num_envs):
+            name = self._draw_object(env, options)
+            prepared = self._load(name)
+            shapes = physics.collision_shapes(prepared)
+            entity = physics.object_entity(prepared, f"scene-{env}_object", shapes, self.scene.can_render())
+            entity.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(0))
+            self.scene.sub_scenes[env].add_entity(entity)
+            self.object_name[env] = prepared.name
+            entities.append(entity)
+        self._register_object(entities)
+
+    def _register_object(self, entities: list[sapien.Entity]) -> None:
+        scene_idxs = torch.arange(self.num_envs, dtype=torch.int, device=self.device)
+        actor = Actor.create_from_entities(entities, self.scene, scene_idxs, shared_name="object")
+        actor.initial_pose = Pose.create(entities[0].pose, device=self.device)
+        self.scene.actors["object"] = actor
+        self.object_actor = actor
+
+    # -- episodes ---------------------------------------------------------------------------------------------
+    def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict]:
+        """Starts an episode; see the class docstring for ``options``."""
+        options = dict(options or {})
+        for key in ("object", "pose"):
+            if key in options and not isinstance(options[key], (list, tuple)):
+                options[key] = [options[key]] * self.num_envs
+            if key in options and len(options[key]) != self.num_envs:
+                raise InvalidInputError(
+                    f"options[{key!r}]: {len(options[key])} values for {self.num_envs} environments; give one each"
+                )
+        for name in options.get("object", ()):
+            self._load(name)
+        for pose in options.get("pose", ()):
+            grids.check_pose(pose)
+        return super().reset(seed=seed, options=options)
+
+    def _load(self, name: str) -> PreparedObject:
+        if name not in self._prepared:
+            prepared = load_object(name, self.split)
+            self._prepared[name] = self._prepared[prepared.name] = prepared
+        return self._prepared[name]
+
+    def _draw_object(self, env: int, options: dict) -> str:
+        draw = int(self._batched_episode_rng[env].randint(len(self._object_names)))  # drawn even if not used
+        return options["object"][env] if "object" in options else self._object_names[draw]
+
+    def _draw_pose(self, env: int, options: dict) -> int:
+        draw = int(self._batched_episode_rng[env].randint(NUM_POSES))
+        if "pose" in options:
+            return grids.check_pose(options["pose"][env])
+        return draw if self._pose is None else self._pose
+
+    def _draw_start(self, env: int) -> np.ndarray:
+        """(28,) float32 start of the hand: arm uniform in its box, wrist and fingers open plus noise."""
+        uniform = self._batched_episode_rng[env].uniform(size=NUM_JOINTS)
+        arm = len(START_ARM_LOW)
+        start = _OPEN_QPOS + START_FINGER_NOISE * (2 * uniform - 1)
+        start[:arm] = np.array(START_ARM_LOW) + (np.array(START_ARM_HIGH) - np.array(START_ARM_LOW)) * uniform[:arm]
+        return np.clip(start, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1]).astype(np.float32)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        envs = env_idx.tolist()
+        starts = []
+        for env in envs:
+            name = self._draw_object(env, options)
+            if not self.gpu_sim_enabled:
+                self.object_name[env] = self._load(name).name
+            self.pose[env] = self._draw_pose(env, options)
+            starts.append(self._draw_start(env))
+            prepared = self._load(self.object_name[env])
+            self._sensing.set_object(env, prepared.name, prepared.field, self.pose[env])
+            if self._rewards is not None and self._rewards.needs_surface:
+                surface = prepared.surface_points[:SURFACE_SUBSAMPLE] @ grids.pose_rotation(self.pose[env]).T
+                self._rewards.set_surface(env, surface)
+        order = np.argsort(self.agent.joint_order)  # from JOINT_NAMES to the simulator's order
+        qpos = np.stack(starts)[:, order]
+        if self.gpu_sim_enabled:
+            self._place_gpu_objects(env_idx, qpos)
+        else:
+            self._fresh_physics(self._load(self.object_name[0]), self.pose[0], qpos[0])
+        self._sensing.begin(envs)
+        if self._rewards is not None:
+            self._rewards.begin(envs)
+        self._contacts = None
+        self._reward = None
+        if not self.gpu_sim_enabled and bool(self._sensing.touches(self.agent.host_skin_matrices()).any()):
+            raise AssetError(f"{self.object_name[0]}: touches the hand at the start, so it does not fit in the workspace")
+
+    def _place_gpu_objects(self, env_idx: torch.Tensor, qpos: np.ndarray) -> None:
+        """Turns the objects and places the hands of ``env_idx``. Not run on a GPU yet."""
+        quaternions = np.stack([physics.pose_quaternion(self.pose[env]) for env in env_idx.tolist()])
+        position = torch.zeros((len(env_idx), 3), device=self.device)
+        rotation = torch.tensor(quaternions, dtype=torch.float32, device=self.device)
+        self.object_actor.set_pose(Pose.create_from_pq(position, rotation))
+        self.agent.robot.set_qpos(torch.tensor(qpos, device=self.device))
+        self.agent.robot.set_qvel(torch.zeros_like(self.agent.robot.get_qvel()[env_idx]))
+
+    def _fresh_physics(self, prepared: PreparedObject, pose: int, qpos: np.ndarray) -> None:
+        """Moves hand and object into a new physics system, so that an episode does not depend on those before it.
+
+        PhysX keeps contact caches that a soft reset leaves behind: its episodes differ from the first contact on.
+        """
+        old = self.scene.sub_scenes[0]
+        body = self._bodies.get(prepared.name)
+        if body is None:
+            self._set_scene_config()
+            shapes = physics.collision_shapes(prepared)
+            body = physics.object_entity(prepared, "scene-0_object", shapes, self.scene.can_render())
+            self._bodies[prepared.name] = body
+        entities = [e for e in old.entities if e.name != "scene-0_object"]
+        for entity in list(old.entities):
+            old.remove_entity(entity)
+        self._set_scene_config()
+        system = physx.PhysxCpuSystem()
+        system.timestep = self.sim_timestep
+        systems: list[Any] = [system]
+        if self.scene.can_render():
+            systems.append(old.render_system)
+        new = sapien.Scene(systems)
+        robot = self.agent.robot._objs[0]
+        for entity in entities:
+            new.add_entity(entity)
+        body.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(pose))
+        new.add_entity(body)
+        robot.set_root_pose(AdroitHand.base_pose())
+        robot.set_qpos(qpos)
+        robot.set_qvel(np.zeros_like(qpos))
+        robot.set_qf(np.zeros_like(qpos))
+        self.scene.sub_scenes[0] = new
+        self.scene.px = system
+        self._register_object([body])
+
+    # -- step -------------------------------------------------------------------------------------------------
+    def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+        """One control step (30.1 ms).
+
+        Args:
+            action: (28,) or (E, 28), clipped to [-1, 1].
+
+        Raises:
+            InvalidInputError: the action has another shape or is not finite.
+        """
+        return super().step(self._checked(action))
+
+    def _checked(self, action: Any) -> torch.Tensor:
+        try:
+            value = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidInputError(f"action: not an array of numbers ({error}); give a float array (28,)") from error
+        if self.num_envs == 1 and value.shape == (NUM_JOINTS,):
+            value = value[None]
+        if value.shape != (self.num_envs, NUM_JOINTS):
+            expected = f"({self.num_envs}, {NUM_JOINTS})"
+            raise InvalidInputError(f"action: shape {tuple(value.shape)}, expected {expected}; one number per joint")
+        # A check on the GPU would stall it every step; the drive targets are clipped there all the same.
+        if not self.gpu_sim_enabled and not bool(np.isfinite(value.numpy()).all()):
+            joint = JOINT_NAMES[int(np.flatnonzero(~np.isfinite(value.numpy()).all(0))[0])]
+            raise InvalidInputError(f"action: not finite for joint {joint}; give numbers in [-1, 1]")
+        return value
+
+    def _step_action(self, action: Any) -> Any:
+        action = super()._step_action(action)
+        step = self._elapsed_steps + 1
+        if self.gpu_sim_enabled:
+            self._contacts = self._sensing.step(self.agent.device_skin_matrices(), step)
+        else:
+            self._contacts = self._sensing.step(self.agent.host_skin_matrices(), step.numpy())
+        if self._rewards is not None:
+            self._reward = self._rewards.step(self._contacts)
+        return action
+
+    def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """(E,) float32 reward of the last step in the environment's reward mode."""
+        if self._reward is None:
+            return torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
+        return self._tensor(self._reward)
+
+    def get_info(self) -> dict:
+        """``elapsed_steps``, and how many voxels the last step touched and visited for the first time."""
+        info = {"elapsed_steps": self._elapsed_steps.clone()}
+        for key in ("new_touched", "new_visited"):
+            count = None if self._contacts is None else getattr(self._contacts, key)
+            info[key] = torch.zeros_like(self._elapsed_steps, dtype=torch.int64) if count is None else self._tensor(count)
+        return info
+
+    def _tensor(self, value: Any) -> torch.Tensor:
+        return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+    # -- observation ------------------------------------------------------------------------------------------
+    def _get_obs_state_dict(self, info: dict) -> dict[str, torch.Tensor]:
+        return {**self._get_obs_agent(), **self._get_obs_extra(info)}
+
+    def _get_obs_agent(self) -> dict[str, torch.Tensor]:
+        if self.gpu_sim_enabled:
+            order = torch.as_tensor(self.agent.joint_order, device=self.device)
+            return {"qpos": self.agent.robot.get_qpos()[:, order], "qvel": self.agent.robot.get_qvel()[:, order]}
+        return {"qpos": torch.from_numpy(self.agent.host_qpos()), "qvel": torch.from_numpy(self.agent.host_qvel())}
+
+    def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
+        touch, touched, visited = self._sensing.link_touch(), self._sensing.touched, self._sensing.visited
+        if self.gpu_sim_enabled:
+            occupancy = torch.stack([touched, visited], dim=1).to(torch.uint8)
+            touch = touch.to(torch.uint8)
+        else:
+            occupancy = torch.from_numpy(np.stack([touched, visited], axis=1).view(np.uint8))
+            touch = torch.from_numpy(touch.view(np.uint8))
+        time = (self._elapsed_steps.to(torch.float32) / HORIZON).clamp(max=1.0)[:, None]
+        return {"touch": touch, "occupancy": occupancy, "time": time}
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self._obs_mode == "state":
+            return torch.cat([value.reshape(self.num_envs, -1).to(torch.float32) for value in obs.values()], dim=1)
+        if self.obs_mode_struct.state and isinstance(obs, dict) and "agent" in obs:
+            state = {**obs.pop("agent"), **obs.pop("extra")}
+            obs["state"] = torch.cat([v.reshape(self.num_envs, -1).to(torch.float32) for v in state.values()], dim=1)
+        return obs
+
+    # -- what the hand has learned ----------------------------------------------------------------------------
+    @property
+    def touched(self) -> Any:
+        """(E, 32, 32, 32) bool, world frame; a view that the next step changes."""
+        return self._sensing.touched
+
+    @property
+    def visited(self) -> Any:
+        """(E, 32, 32, 32) bool, world frame; a view that the next step changes."""
+        return self._sensing.visited
+
+    @property
+    def touched_step(self) -> Any:
+        """(E, 32, 32, 32) int16, step (1..200) of the first touch, -1 where never touched; a view."""
+        return self._sensing.touched_step
+
+
+register(ENVIRONMENT_ID, TactileSLAMEnv, max_episode_steps=HORIZON)

@@ -1,0 +1,42 @@
+"""Registers the environment ids with Gymnasium, without importing the simulator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import WrapperSpec
+
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON
+
+ENVIRONMENT_IDS = (ENVIRONMENT_ID,)
+"""Every id that the package registers."""
+
+
+def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
+    """Makes the unwrapped environment; what ``gymnasium.make`` calls."""
+    import mani_skill.utils.registration
+    import tslam_bench.tasks.tactile_slam  # noqa: F401  (registers with ManiSkill)
+
+    return mani_skill.utils.registration.make(environment_id, **kwargs)
+
+
+def register_environments() -> None:
+    """Registers every id; safe to call twice."""
+    for environment_id in ENVIRONMENT_IDS:
+        if environment_id in gymnasium.registry:
+            continue
+        gymnasium.register(
+            environment_id,
+            entry_point="tslam_bench.registration:make_environment",
+            max_episode_steps=HORIZON,
+            disable_env_checker=True,  # ManiSkill environments return batched tensors, which the checker refuses
+            kwargs={"environment_id": environment_id},
+            additional_wrappers=(
+                WrapperSpec(
+                    "MSTimeLimit",
+                    entry_point="mani_skill.utils.registration:TimeLimitWrapper",
+                    kwargs={"max_episode_steps": HORIZON},
+                ),
+            ),
+        )

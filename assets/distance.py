@@ -12,7 +12,9 @@ from tslam_bench.assets.meshes import TriangleMesh
 def distance_to_mesh(points: NDArray[np.float64], mesh: TriangleMesh) -> NDArray[np.float64]:
     """Exact unsigned distance (M,) in metres from ``points`` (M, 3) to the surface."""
     squared, *_ = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+        np.ascontiguousarray(points, dtype=np.float64),
+        np.ascontiguousarray(mesh.vertices),
+        np.ascontiguousarray(mesh.faces),
     )
     return np.sqrt(np.maximum(squared, 0.0))
 

@@ -64,7 +64,9 @@ def fetch_wheel(name: str, version: str, sha256: str, cache: Path | None = None)
         try:
             result = subprocess.run(command, capture_output=True, text=True, check=False)
         except OSError as error:
-            raise AssetError(f"{name}=={version}: cannot start pip ({error}); run inside an environment that has pip") from error
+            raise AssetError(
+                f"{name}=={version}: cannot start pip ({error}); run inside an environment that has pip"
+            ) from error
         wheel = _find_wheel(Path(temporary), name, version)
         if result.returncode != 0 or wheel is None:
             raise AssetError(

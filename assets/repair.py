@@ -87,10 +87,11 @@ def largest_part(solid: manifold3d.Manifold) -> tuple[manifold3d.Manifold, float
         shells = [part for part in union(shells).decompose() if part.volume() > 0]
     total = sum(part.volume() for part in shells)
     best = max(shells, key=lambda part: part.volume())
+    share = float(best.volume() / total)
     for void in voids:
         outward = from_manifold(void)
         best = best - to_manifold(TriangleMesh(outward.vertices, outward.faces[:, ::-1]))
-    return best, float(best.volume() / total) if not voids else 1.0
+    return best, share
 
 
 def winding_is_unambiguous(mesh: TriangleMesh, count: int = 20_000) -> bool:

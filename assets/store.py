@@ -1,17 +1,47 @@
 """Prepared objects on disk: the one format that tasks, reconstruction and scoring read.
 
-An object is a directory ``<cache>/objects/<split>/<name>/``. All geometry is in the object frame (canonical orientation,
-origin at the bounding-box centre), in metres. numpy only.
+An object is a directory ``<cache>/objects/<split>/<name>/`` of plain ``.npy`` files and a ``record.json`` that lists them with
+shape, type and SHA-256. All geometry is in the object frame (canonical orientation, origin at the bounding-box centre), in
+metres. numpy only.
 """
 
 from __future__ import annotations
 
+import difflib
+import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tslam_bench.assets import contactdb
+from tslam_bench.constants import IOU_POINTS, SURFACE_SAMPLES
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.files import atomic_directory, cache_directory, sha256_file, write_json
+from tslam_bench.grids import pack, unpack
+
+FORMAT = 1
+"""Version of the directory layout."""
+SPLITS = ("test", "train", "val")
+"""The benchmark's own splits; an organiser may add others."""
+SPLIT_ALIASES = {"contactdb50": "test"}
+
+ARRAYS = (
+    "vertices",
+    "faces",
+    "hull_vertices",
+    "hull_faces",
+    "hull_offsets",
+    "field",
+    "grids",
+    "surface_points",
+    "surface_faces",
+    "iou_bits",
+)
+"""The files of an object, without ``.npy``."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +96,263 @@ class PreparedObject:
     record: dict[str, Any]
 
 
+def check_split(split: str, cache: Path | None = None) -> str:
+    """Canonical name of a split. Raises InvalidInputError unless it is ours or prepared in the cache."""
+    resolved = SPLIT_ALIASES.get(split, split)
+    root = (cache or cache_directory()) / "objects"
+    if resolved in SPLITS or (re.fullmatch(r"[A-Za-z0-9_-]+", resolved) and (root / resolved).is_dir()):
+        return resolved
+    known = sorted({*SPLITS, *SPLIT_ALIASES})
+    raise InvalidInputError(f"split {split!r}: unknown{_suggest(split, known)}; choose one of {', '.join(known)}")
+
+
+def split_directory(split: str, cache: Path | None = None) -> Path:
+    """Directory of a split's objects (may not exist)."""
+    return (cache or cache_directory()) / "objects" / split
+
+
+def object_directory(name: str, split: str, cache: Path | None = None) -> Path:
+    """Directory of one object (may not exist)."""
+    return split_directory(split, cache) / name
+
+
+def rebuild_command(name: str, split: str) -> str:
+    """The command that prepares one object."""
+    command = "tslam-bench assets prepare" + ("" if split == "test" else f" --split {split}")
+    return f"{command} --objects {name}"
+
+
+def prepared_names(split: str, cache: Path | None = None) -> list[str]:
+    """Names of the objects that a split's directory holds, sorted."""
+    directory = split_directory(split, cache)
+    if not directory.is_dir():
+        return []
+    return sorted(path.parent.name for path in directory.glob("[!.]*/record.json"))
+
+
+def known_names(split: str, cache: Path | None = None) -> list[str]:
+    """Names (without aliases) of a split: the definition's for ``test``, what is prepared for the others; sorted."""
+    return sorted(contactdb.OBJECTS) if split == "test" else prepared_names(split, cache)
+
+
+def _suggest(name: str, known: list[str]) -> str:
+    """ " (did you mean ...?)" when there are near matches."""
+    near = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.5)
+    return f" (did you mean {' or '.join(near)}?)" if near else ""
+
+
+def resolve_name(name: str, split: str = "test", cache: Path | None = None) -> str:
+    """The object that ``name``, which may be an alias, stands for in a canonical split.
+
+    Raises:
+        InvalidInputError: there is no such object; the message lists near matches.
+    """
+    if split == "test":
+        if name in contactdb.ALIASES:
+            return contactdb.ALIASES[name]
+        if name in contactdb.EXCLUDED:
+            raise InvalidInputError(f"object {name!r}: left out of split test: {contactdb.EXCLUDED[name]}")
+    known = known_names(split, cache)
+    if name in known:
+        return name
+    if not known:
+        raise AssetError(
+            f"object {name!r}: split {split} is not prepared; run: tslam-bench assets prepare --split {split}"
+        )
+    candidates = [*known, *contactdb.ALIASES] if split == "test" else known
+    raise InvalidInputError(
+        f"object {name!r}: unknown in split {split}{_suggest(name, candidates)}; "
+        f"see: tslam-bench assets list --split {split}"
+    )
+
+
+def _read_record(directory: Path, name: str, split: str) -> dict[str, Any]:
+    path = directory / "record.json"
+    if not path.exists():
+        raise AssetError(f"object {name!r} of split {split} is not prepared; run: {rebuild_command(name, split)}")
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["name"] != name or not isinstance(record["products"], dict):
+            raise ValueError("not the record of this object")
+        if record["format"] != FORMAT:
+            raise ValueError(f"format {record['format']}, expected {FORMAT}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AssetError(
+            f"{path}: corrupt or outdated ({error}); rebuild it with: {rebuild_command(name, split)}"
+        ) from error
+    return record
+
+
+def _read_array(directory: Path, product: str, record: dict[str, Any]) -> NDArray[Any]:
+    """One array, compared with the shape and type that the record states."""
+    path = directory / f"{product}.npy"
+    try:
+        array = np.load(path)
+        stated = record["products"][path.name]
+        if list(array.shape) != stated["shape"] or str(array.dtype) != stated["dtype"]:
+            raise ValueError(f"holds {array.dtype} {array.shape}, expected {stated['dtype']} {tuple(stated['shape'])}")
+    except FileNotFoundError as error:
+        command = rebuild_command(record["name"], record["split"])
+        raise AssetError(f"{path}: missing; rebuild it with: {command}") from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        command = rebuild_command(record["name"], record["split"])
+        raise AssetError(f"{path}: corrupt ({error}); rebuild it with: {command}") from error
+    return array
+
+
 def load_object(name: str, split: str = "test", cache: Path | None = None) -> PreparedObject:
     """Loads one prepared object (aliases of section 8 resolve to their object).
+
+    Shapes and types are checked; contents are hashed by ``tslam-bench assets verify`` only.
 
     Raises:
         InvalidInputError: the name is unknown in the split (the message lists near matches).
         AssetError: the object is known but not prepared, or a product is missing or corrupt (names the file and the command
             that rebuilds it).
     """
-    raise AssetError("not written")
+    split = check_split(split, cache)
+    name = resolve_name(name, split, cache)
+    directory = object_directory(name, split, cache)
+    record = _read_record(directory, name, split)
+    arrays = {product: _read_array(directory, product, record) for product in ARRAYS}
+    try:
+        faces = arrays["faces"].astype(np.int64)
+        hull_vertices, hull_faces = arrays["hull_vertices"], arrays["hull_faces"].astype(np.int64)
+        offsets = arrays["hull_offsets"].tolist()
+        hulls = tuple(
+            (hull_vertices[v0:v1], hull_faces[f0:f1])
+            for (v0, f0), (v1, f1) in zip(offsets[:-1], offsets[1:], strict=True)
+        )
+        field = SignedDistanceField(
+            origin=np.array(record["field"]["origin"], dtype=np.float64),
+            spacing=float(record["field"]["spacing"]),
+            values=arrays["field"].astype(np.float32),
+            surface_error=float(record["field"]["surface_error"]),
+        )
+        iou_bits = np.unpackbits(arrays["iou_bits"], axis=1, count=IOU_POINTS).astype(bool)
+        return PreparedObject(
+            name=name,
+            split=split,
+            category=record["category"],
+            vertices=arrays["vertices"],
+            faces=faces,
+            hulls=hulls,
+            field=field,
+            solid=unpack(arrays["grids"][0]),
+            surface=unpack(arrays["grids"][1]),
+            surface_points=arrays["surface_points"],
+            surface_normals=_face_normals(arrays["vertices"], faces)[arrays["surface_faces"]],
+            solid_at_iou_points=iou_bits[0],
+            raw_solid_at_iou_points=iou_bits[1],
+            record=record,
+        )
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise AssetError(
+            f"{directory}: products do not fit together ({error}); rebuild them with: {rebuild_command(name, split)}"
+        ) from error
+
+
+def _face_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
 
 
 def list_objects(split: str = "test", cache: Path | None = None) -> list[dict[str, Any]]:
-    """Manifest records of the prepared objects of a split, sorted by name."""
-    raise AssetError("not written")
+    """Manifest records of the prepared objects of a split, sorted by name.
+
+    Raises:
+        InvalidInputError: the split is unknown.
+        AssetError: a record is corrupt.
+    """
+    split = check_split(split, cache)
+    return [
+        _read_record(object_directory(name, split, cache), name, split)
+        for name in prepared_names(split, cache)
+        if split != "test" or name in contactdb.OBJECTS
+    ]
+
+
+def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Path | None = None) -> dict[str, Any]:
+    """Writes an object's products and its record, atomically.
+
+    Args:
+        prepared: the object; ``record`` holds what the manifest says besides the fields that are added here (``format``,
+            ``name``, ``split``, ``category``, ``field``, ``products``).
+        surface_faces: (100000,) the face that each surface sample lies on.
+        cache: cache directory (default: the user's).
+
+    Returns:
+        the full record as written.
+
+    Raises:
+        AssetError: the cache cannot be written.
+    """
+    if prepared.surface_points.shape != (SURFACE_SAMPLES, 3) or surface_faces.shape != (SURFACE_SAMPLES,):
+        raise InvalidInputError(f"{prepared.name}: {SURFACE_SAMPLES} surface samples with their faces expected")
+    counts = np.array([[len(vertices), len(faces)] for vertices, faces in prepared.hulls], dtype=np.int64)
+    offsets = np.concatenate([np.zeros((1, 2), dtype=np.int64), np.cumsum(counts, axis=0)])
+    iou = np.stack([prepared.solid_at_iou_points, prepared.raw_solid_at_iou_points])
+    arrays: dict[str, NDArray[Any]] = {
+        "vertices": prepared.vertices.astype(np.float64),
+        "faces": prepared.faces.astype(np.int32),
+        "hull_vertices": np.concatenate([vertices for vertices, _ in prepared.hulls]).astype(np.float64),
+        "hull_faces": np.concatenate([faces for _, faces in prepared.hulls]).astype(np.uint8),
+        "hull_offsets": offsets.astype(np.int32),
+        "field": prepared.field.values.astype(np.float16),
+        "grids": np.stack([pack(prepared.solid), pack(prepared.surface)]),
+        "surface_points": prepared.surface_points.astype(np.float32),
+        "surface_faces": surface_faces.astype(np.int32),
+        "iou_bits": np.packbits(iou, axis=1),
+    }
+    target = object_directory(prepared.name, prepared.split, cache)
+    with atomic_directory(target) as directory:
+        products = {}
+        for product in ARRAYS:
+            path = directory / f"{product}.npy"
+            np.save(path, arrays[product])
+            products[path.name] = {
+                "shape": list(arrays[product].shape),
+                "dtype": str(arrays[product].dtype),
+                "bytes": path.stat().st_size,
+                "sha256": sha256_file(path),
+            }
+        record = dict(prepared.record) | {
+            "format": FORMAT,
+            "name": prepared.name,
+            "split": prepared.split,
+            "category": prepared.category,
+            "field": {
+                "origin": [float(x) for x in prepared.field.origin],
+                "spacing": prepared.field.spacing,
+                "shape": list(prepared.field.values.shape),
+                "surface_error": prepared.field.surface_error,
+            },
+            "products": products,
+        }
+        write_json(directory / "record.json", record)
+    return record
+
+
+def damage(name: str, split: str = "test", cache: Path | None = None) -> list[str]:
+    """Reads and hashes every product of one prepared object.
+
+    Returns:
+        one line per product that is missing or does not have its recorded SHA-256; empty when all is well.
+    """
+    directory = object_directory(name, split, cache)
+    try:
+        record = _read_record(directory, name, split)
+    except AssetError as error:
+        return [str(error)]
+    lines = []
+    for product, stated in record["products"].items():
+        path = directory / product
+        if not path.exists():
+            lines.append(f"{path}: missing")
+        elif sha256_file(path) != stated["sha256"]:
+            lines.append(f"{path}: does not have its recorded SHA-256")
+    missing = {f"{product}.npy" for product in ARRAYS} - set(record["products"])
+    lines += [f"{directory / product}: not in the record" for product in sorted(missing)]
+    return lines

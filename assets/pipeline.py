@@ -1,0 +1,180 @@
+"""From one source mesh to all products of one prepared object."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from tslam_bench.assets import decompose, field, occupancy, repair, store, voids
+from tslam_bench.assets.distance import distance_to_mesh, sample_surface
+from tslam_bench.assets.meshes import TriangleMesh, from_manifold, to_manifold
+from tslam_bench.constants import REACHABLE_BALL_RADIUS, SIGNED_DISTANCE_TOLERANCE, WORKSPACE_EDGE
+from tslam_bench.errors import AssetError
+from tslam_bench.files import cache_directory
+
+PIPELINE_VERSION = 1
+"""Bumped when the same source gives other products."""
+MIN_HULL_IOU = 0.85
+"""Gate: IoU(hull union, ground truth) below this needs an explicit exception."""
+MIN_EXTENT = 5e-3
+"""An object's longest edge is at least this (m): anything smaller has a wrong unit."""
+_SEED = 20211110
+
+
+@dataclass(frozen=True)
+class SourceMesh:
+    """A mesh as its source gives it, in metres, in its canonical orientation.
+
+    Attributes:
+        name, split, category, aliases: identifiers.
+        mesh: the triangles, not necessarily watertight.
+        source: where it comes from, for people.
+        license: its licence text.
+        sha256: hash of the source file (or of the mesh, where there is no file).
+        details: further facts for the record (creator, scale, seed).
+    """
+
+    name: str
+    split: str
+    category: str
+    mesh: TriangleMesh
+    source: str
+    license: str
+    sha256: str
+    aliases: tuple[str, ...] = ()
+    details: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+class Source(Protocol):
+    """What can be prepared: a picklable promise of a source mesh."""
+
+    @property
+    def name(self) -> str:
+        """Name of the object."""
+
+    @property
+    def split(self) -> str:
+        """Split of the object."""
+
+    def fingerprint(self) -> str:
+        """A string that changes whenever :meth:`load` would return something else."""
+
+    def load(self, cache: Path) -> SourceMesh:
+        """Reads or makes the mesh. Raises AssetError."""
+
+
+def parameters_sha256(source: Source) -> str:
+    """Hash of everything that decides an object's products: source, pipeline version, settings, limits."""
+    parameters = {
+        "pipeline": PIPELINE_VERSION,
+        "format": store.FORMAT,
+        "source": source.fingerprint(),
+        "decomposition": dataclasses.asdict(decompose.settings_for(source.split, source.name)),
+        "coacd": version("coacd"),
+        "triangles": repair.MAX_TRIANGLES,
+        "ball": REACHABLE_BALL_RADIUS,
+        "field": [field.PADDING, SIGNED_DISTANCE_TOLERANCE],
+    }
+    return hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()
+
+
+def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
+    """Builds and writes every product of one object.
+
+    Returns:
+        its record.
+
+    Raises:
+        AssetError: the source cannot be read, no solid can be made of it, or the cache cannot be written.
+    """
+    cache = cache or cache_directory()
+    try:
+        item = source.load(cache)
+        check_size(item.mesh)
+        repaired = repair.repair(item.mesh)
+        filled = voids.fill_voids(repaired.solid)
+        settings = decompose.settings_for(item.split, item.name)
+        ground_truth = from_manifold(filled.solid)
+        low, high = ground_truth.bounds
+        centre = (low + high) / 2
+        ground_truth = ground_truth.translated(-centre)
+        raw = from_manifold(repaired.solid).translated(-centre)
+        original = item.mesh.translated(-centre)
+        hulls = decompose.decompose_cached(ground_truth, settings, cache / "decompositions")
+        hull_solid = decompose.hull_union(hulls)
+        truth_solid = to_manifold(ground_truth)
+        iou = decompose.intersection_over_union(hull_solid, truth_solid)
+        distances = field.build_field(hulls)
+        points, faces = occupancy.surface_samples(ground_truth)
+        solid_points = occupancy.solid_at_iou_points(ground_truth)
+        raw_points = occupancy.solid_at_iou_points(raw) if filled.volume > 0 else solid_points
+        gates = {
+            "hull_iou": iou,
+            "hull_iou_passes": iou >= MIN_HULL_IOU,
+            "hull_volume_ratio": hull_solid.volume() / truth_solid.volume(),
+            "field_error_m": distances.surface_error,
+            "field_passes": distances.surface_error <= SIGNED_DISTANCE_TOLERANCE,
+            "repair_error_p99_m": _repair_error(original, raw),
+            "genus": truth_solid.genus(),
+            "kept_share": repaired.kept_share,
+        }
+        record = {
+            "aliases": list(item.aliases),
+            "source": item.source,
+            "license": item.license,
+            "source_sha256": item.sha256,
+            "details": item.details,
+            "parameters_sha256": parameters_sha256(source),
+            "repair": repaired.method,
+            "extents_m": [float(x) for x in ground_truth.extents],
+            "volume_m3": truth_solid.volume(),
+            "filled_volume_m3": filled.volume,
+            "differs_from_raw": filled.volume > 0,
+            "triangles": len(ground_truth.faces),
+            "hull_count": len(hulls),
+            "decomposition": dataclasses.asdict(settings),
+            "gates": gates,
+        }
+        prepared = store.PreparedObject(
+            name=item.name,
+            split=item.split,
+            category=item.category,
+            vertices=ground_truth.vertices,
+            faces=ground_truth.faces,
+            hulls=tuple((hull.vertices, hull.faces) for hull in hulls),
+            field=distances,
+            solid=occupancy.solid_grid(ground_truth),
+            surface=occupancy.surface_grid(ground_truth),
+            surface_points=points.astype(np.float32),
+            surface_normals=ground_truth.face_normals()[faces].astype(np.float32),
+            solid_at_iou_points=solid_points,
+            raw_solid_at_iou_points=raw_points,
+            record=record,
+        )
+        return store.write(prepared, faces, cache)
+    except AssetError as error:
+        raise AssetError(f"{source.split}/{source.name}: {error}") from error
+
+
+def check_size(mesh: TriangleMesh) -> None:
+    """Raises AssetError for a mesh that is empty, not finite, or whose size cannot be in metres."""
+    if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise AssetError("not a mesh: no triangles, or vertices that are not finite")
+    longest = float(mesh.extents.max())
+    if not MIN_EXTENT <= longest <= WORKSPACE_EDGE:
+        raise AssetError(
+            f"longest edge {longest:.4g} m is outside {MIN_EXTENT} to {WORKSPACE_EDGE} m; check the unit of the mesh"
+        )
+
+
+def _repair_error(original: TriangleMesh, repaired: TriangleMesh) -> float:
+    """99th percentile (m) of the distance from the original surface to the repaired one."""
+    points, _ = sample_surface(original, 20_000, np.random.default_rng(_SEED))
+    return float(np.quantile(distance_to_mesh(points, repaired), 0.99))

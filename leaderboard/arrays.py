@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,15 +77,7 @@ def read_npz(data: bytes, expected: Mapping[str, Expected], where: str) -> dict[
 def _read_array(archive: zipfile.ZipFile, name: str, expected: Expected, where: str) -> NDArray:
     label = name.removesuffix(".npy")
     with archive.open(name) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-        elif version == (2, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
-        else:
-            raise InvalidInputError(
-                f"{where}: {label} has format version {version}; save it with numpy.savez_compressed"
-            )
+        shape, fortran, dtype = _read_header(stream, f"{where}: {label}")
         if dtype.hasobject:
             raise InvalidInputError(
                 f"{where}: {label} holds pickled objects, which are never loaded; save plain arrays"
@@ -96,3 +89,13 @@ def _read_array(archive: zipfile.ZipFile, name: str, expected: Expected, where: 
         if len(data) != size:
             raise InvalidInputError(f"{where}: {label} is truncated or too long; write it again")
     return np.frombuffer(data, dtype=dtype).reshape(shape, order="F" if fortran else "C").copy()
+
+
+def _read_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and data type of the array that follows in ``stream``."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        return read(stream)
+    except Exception as error:  # numpy parses the header as Python source: damage raises nearly anything
+        raise InvalidInputError(f"{where} has a damaged header; save it with numpy.savez_compressed") from error

@@ -55,9 +55,10 @@ def test_iou_refuses_different_shapes() -> None:
 def test_iou_of_translated_spheres_at_the_iou_points() -> None:
     """Lens of two spheres: V = pi (4 r + d)(2 r - d)^2 / 12."""
     radius, shift = 0.06, 0.03
+    centre = np.array([shift / 2, 0, 0])
     points = iou_points()
-    a = np.linalg.norm(points - [shift / 2, 0, 0], axis=1) <= radius
-    b = np.linalg.norm(points + [shift / 2, 0, 0], axis=1) <= radius
+    a = np.linalg.norm(points - centre, axis=1) <= radius
+    b = np.linalg.norm(points + centre, axis=1) <= radius
     lens = math.pi * (4 * radius + shift) * (2 * radius - shift) ** 2 / 12
     expected = lens / (2 * 4 / 3 * math.pi * radius**3 - lens)
     share = (2 * 4 / 3 * math.pi * radius**3 - lens) / WORKSPACE_EDGE**3
@@ -68,14 +69,15 @@ def test_iou_of_translated_spheres_at_the_iou_points() -> None:
 def test_monte_carlo_deviation_of_iou() -> None:
     """Binomial: sd = sqrt(IoU (1 - IoU) / points in the union)."""
     radius, shift, count = 0.08, 0.02, 20_000
+    centre = np.array([shift / 2, 0, 0])
     lens = math.pi * (4 * radius + shift) * (2 * radius - shift) ** 2 / 12
     union = 2 * 4 / 3 * math.pi * radius**3 - lens
     expected = lens / union
     values = []
     for seed in range(200):
         points = WORKSPACE_EDGE * (rng(seed).random((count, 3)) - 0.5)
-        a = np.linalg.norm(points - [shift / 2, 0, 0], axis=1) <= radius
-        b = np.linalg.norm(points + [shift / 2, 0, 0], axis=1) <= radius
+        a = np.linalg.norm(points - centre, axis=1) <= radius
+        b = np.linalg.norm(points + centre, axis=1) <= radius
         values.append(metrics.iou(a, b))
     deviation = math.sqrt(expected * (1 - expected) / (count * union / WORKSPACE_EDGE**3))
     assert np.mean(values) == pytest.approx(expected, abs=4 * deviation / math.sqrt(200))
@@ -132,7 +134,7 @@ def test_chamfer_of_parallel_plates() -> None:
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     a, _ = metrics.sample_surface(square, faces, 40_000, rng(1))
-    b, _ = metrics.sample_surface(square + [0, 0, 0.1], faces, 40_000, rng(2))
+    b, _ = metrics.sample_surface(square + np.array([0, 0, 0.1]), faces, 40_000, rng(2))
     match = metrics.match_surfaces(a, b)
     assert metrics.chamfer_l2(match) == pytest.approx(0.01, rel=0.01)
     assert metrics.chamfer_l1(match) == pytest.approx(0.1, rel=0.01)

@@ -34,7 +34,7 @@ class Volume:
             interpolation is unknown.
     """
 
-    probability: NDArray[np.float32]
+    probability: NDArray
     interpolation: Interpolation = "linear"
 
     def __post_init__(self) -> None:

@@ -8,8 +8,10 @@ metres. numpy only.
 from __future__ import annotations
 
 import difflib
+import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -272,6 +274,21 @@ def list_objects(split: str = "test", cache: Path | None = None) -> list[dict[st
         for name in prepared_names(split, cache)
         if split != "test" or name in contactdb.OBJECTS
     ]
+
+
+def asset_sha256(names: Iterable[str], split: str = "test", cache: Path | None = None) -> str:
+    """SHA-256 over the products of the objects ``names``: what rollouts were made with and scores were computed from.
+
+    Raises:
+        InvalidInputError: a name is unknown.
+        AssetError: an object is not prepared, or its record is corrupt.
+    """
+    split = check_split(split, cache)
+    products = {}
+    for name in sorted({resolve_name(name, split, cache) for name in names}):
+        record = _read_record(object_directory(name, split, cache), name, split)
+        products[name] = {product: stated["sha256"] for product, stated in record["products"].items()}
+    return hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest()
 
 
 def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Path | None = None) -> dict[str, Any]:

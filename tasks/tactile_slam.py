@@ -40,6 +40,7 @@ from tslam_bench.hand_constants import (
     SKIN_LINKS,
     START_ARM_HIGH,
     START_ARM_LOW,
+    START_CLEARANCE,
     START_FINGER_NOISE,
 )
 from tslam_bench.tasks import physics
@@ -50,6 +51,7 @@ from tslam_bench.tasks.rewards import SURFACE_SUBSAMPLE, Rewards
 from tslam_bench.tasks.sensing import Contacts, TactileSensing
 from tslam_bench.tasks.skin import build_skin
 
+_HEIGHT = JOINT_NAMES.index("ARTy")
 _OPEN_QPOS = np.clip(0.0, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
 
 
@@ -72,7 +74,7 @@ class TactileSLAMEnv(BaseEnv):
 
     **Rewards.** ``reward_mode`` is one of ``tslam_bench.constants.REWARD_MODES`` (section 7), or ``"none"``.
 
-    **Starting state.** Arm uniform in ``START_ARM_LOW..HIGH`` above W, fingers open with small noise, nothing touched.
+    **Starting state.** Arm uniform in ``START_ARM_LOW..HIGH``, above the object; fingers open with small noise; nothing touched.
 
     **Episode end.** Truncated at step 200, never terminated.
 
@@ -279,11 +281,13 @@ class TactileSLAMEnv(BaseEnv):
         return draw if self._pose is None else self._pose
 
     def _draw_start(self, env: int) -> np.ndarray:
-        """(28,) float32 start of the hand: arm uniform in its box, wrist and fingers open plus noise."""
+        """(28,) float32 start of the hand: arm uniform in its box above the object, wrist and fingers open plus noise."""
         uniform = self._batched_episode_rng[env].uniform(size=NUM_JOINTS)
-        arm = len(START_ARM_LOW)
         start = _OPEN_QPOS + START_FINGER_NOISE * (2 * uniform - 1)
-        start[:arm] = np.array(START_ARM_LOW) + (np.array(START_ARM_HIGH) - np.array(START_ARM_LOW)) * uniform[:arm]
+        low, high = np.array(START_ARM_LOW), np.array(START_ARM_HIGH)
+        top = self._load(self.object_name[env]).vertices[:, 2]  # poses turn about z or half-turn: |z| extents stay
+        low[_HEIGHT] = max(low[_HEIGHT], (-top.min() if self.pose[env] >= 4 else top.max()) + START_CLEARANCE)
+        start[: len(low)] = low + (high - low) * uniform[: len(low)]
         return np.clip(start, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1]).astype(np.float32)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:

@@ -65,15 +65,17 @@ FORCE_LIMIT: Final = _per_joint(60.0, 5.0, 5.0, 1.0)
 """(28,) largest drive force, N or N m."""
 ARMATURE: Final = _per_joint(0.001, 0.001, 0.005, 0.001)
 """(28,) rotor inertia of the model, kg or kg m^2."""
-DELTA_STEP: Final = _per_joint(0.02, 0.1, 0.15, 0.25)
+DELTA_STEP: Final = _per_joint(0.04, 0.2, 0.25, 0.4)
 """(28,) change of the target, relative to the current position, at action 1 in ``pd_joint_delta_pos`` (m or rad)."""
 
 CONTROL_MODES: Final = ("pd_joint_delta_pos", "pd_joint_pos")
 
-START_ARM_LOW: Final = (-0.04, 0.15, -0.06, -0.2)
-START_ARM_HIGH: Final = (0.04, 0.18, 0.02, 0.2)
-"""Box from which an episode's arm qpos (ARTx, ARTy, ARTz, ARRz) is drawn: the open hand is above the workspace, clear of any
-object that fits in it, so that the start tells nothing about the object."""
+START_ARM_LOW: Final = (-0.04, 0.0, -0.06, -0.2)
+START_ARM_HIGH: Final = (0.04, 0.17, 0.02, 0.2)
+"""Box from which an episode's arm qpos (ARTx, ARTy, ARTz, ARRz) is drawn: the open hand lies above the workspace centre."""
+START_CLEARANCE: Final = 0.045
+"""The draw of the height ARTy is restricted to this far (m) above the object's bounding box: room for the palm, the noise of the
+fingers and the roll. The start thus tells of the object only that it is not where the hand is, as touch would."""
 START_FINGER_NOISE: Final = 0.05
 """Finger and wrist joints start at their open value plus uniform noise in +-this (rad), clipped to the limits."""
 

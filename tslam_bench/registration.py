@@ -15,10 +15,11 @@ ENVIRONMENT_IDS = (ENVIRONMENT_ID,)
 
 def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     """Makes the unwrapped environment; what ``gymnasium.make`` calls."""
-    import mani_skill.utils.registration
+    from mani_skill.utils import registration
+
     import tslam_bench.tasks.tactile_slam  # noqa: F401  (registers with ManiSkill)
 
-    return mani_skill.utils.registration.make(environment_id, **kwargs)
+    return registration.make(environment_id, **kwargs)
 
 
 def register_environments() -> None:

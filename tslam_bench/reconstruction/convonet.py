@@ -52,7 +52,8 @@ class ConvONet(nn.Module):
         self.down = nn.ModuleList(
             [_convolution(a, b, kind) for a, b in zip((INPUT_CHANNELS, *widths), widths, strict=False)]
         )
-        self.up = nn.ModuleList([_convolution(a + b, b, kind) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)])
+        upwards = zip(widths[:0:-1], widths[-2::-1], strict=True)
+        self.up = nn.ModuleList([_convolution(a + b, b, kind) for a, b in upwards])
         layers: list[nn.Module] = []
         width = widths[0] + INPUT_CHANNELS
         for hidden in config.decoder_channels:

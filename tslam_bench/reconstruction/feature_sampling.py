@@ -12,8 +12,8 @@ def sample_features(grid: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """Samples feature grids at points, trilinear between cell centres, constant beyond the outermost ones.
 
     ``grid_sample`` is told ``align_corners=False``: -1 and 1 are then the faces of W rather than the outermost centres,
-    so that grids of every resolution share one coordinate. It reads the last axis of its points as (last, middle, first)
-    grid axis, hence the flip.
+    so that grids of every resolution share one coordinate. It reads a point as (last, middle, first) grid axis, hence
+    the flip.
 
     Args:
         grid: (B, C, N, N, N) features of N^3 equal cells of W, index ``[ix, iy, iz]``.

@@ -20,8 +20,8 @@ def hull_points(touched: NDArray[np.bool_]) -> NDArray[np.float64]:
     """The points whose convex hull is the reconstruction: (M, 3) in metres, object frame.
 
     They are the centres of the touched voxels. Centres that span no volume (fewer than four, or all on a line or in a
-    plane) are replaced by the corners of their voxels, which thickens the flat hull to one voxel; a single touched voxel
-    then gives exactly that voxel.
+    plane) are replaced by the corners of their voxels, which thickens the flat hull to one voxel; a single touched
+    voxel then gives exactly that voxel.
     """
     centres = np.argwhere(touched) + 0.5
     # Exact: the differences are small integers, far from the tolerance of the rank.
@@ -34,7 +34,7 @@ def hull_planes(touched: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Half-spaces of the hull of a grid with at least one touched voxel.
 
     Returns:
-        (F, 4) rows ``(n, d)``, ``n`` the outward unit normal: ``x`` is in the hull iff ``n @ x + d <= 0`` for every row (m).
+        (F, 4) rows ``(n, d)``, ``n`` the outward unit normal: ``x`` is in the hull iff ``n @ x + d <= 0`` (m) for all.
     """
     equations = ConvexHull(hull_points(touched)).equations
     # Qhull triangulates its facets: one row of the many equal ones is enough. 1e-9 m is far below any real difference.
@@ -44,9 +44,9 @@ def hull_planes(touched: NDArray[np.bool_]) -> NDArray[np.float64]:
 class HullReconstructor:
     """Convex hull of the touched voxel centres (:func:`hull_points`); free space is not used. Nothing touched: empty.
 
-    The probability is ``0.5 - s / (2 e)`` clipped to [0, 1], with ``e`` the cell edge and ``s`` the largest signed plane
-    distance (m, negative inside): exact inside the hull, never more than the distance outside it, and zero exactly on
-    it. So the 0.5 level of the trilinear volume is the hull, rounded at edges by less than a cell.
+    The probability is ``0.5 - s / (2 e)`` clipped to [0, 1], with ``e`` the cell edge and ``s`` the largest signed
+    plane distance (m, negative inside): exact inside the hull, never more than the distance outside it, and zero
+    exactly on it. So the 0.5 level of the trilinear volume is the hull, rounded at edges by less than a cell.
 
     Args:
         resolution: cells per axis of the volume. An odd multiple of 32 puts a sample on every voxel centre, hence on

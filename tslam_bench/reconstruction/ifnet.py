@@ -28,7 +28,7 @@ class IFNetConfig:
     """Size of an IF-Net. The default is the small one, for CPUs."""
 
     level_channels: tuple[tuple[int, ...], ...] = ((16,), (32,), (64,), (64,), (64,))
-    """Output channels of the successive 3x3x3 convolutions of each level; a level has half the resolution of the one before."""
+    """Output channels of the 3x3x3 convolutions of each level; every level has half the resolution of the one before."""
     decoder_channels: tuple[int, ...] = (128, 128)
     """Hidden layers of the point-wise decoder."""
     displacement: float = 1.0
@@ -54,7 +54,7 @@ class IFNet(nn.Module):
         super().__init__()
         levels = config.level_channels
         if not levels or not all(levels) or GRID_SIZE % 2 ** (len(levels) - 1):
-            raise InvalidInputError(f"level_channels {levels}: give one to six levels, each with at least one convolution")
+            raise InvalidInputError(f"level_channels {levels}: give one to six levels of one convolution or more each")
         self.config = config
         self.levels = nn.ModuleList()
         channels, sampled = INPUT_CHANNELS, INPUT_CHANNELS

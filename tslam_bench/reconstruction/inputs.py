@@ -14,6 +14,7 @@ from tslam_bench.errors import InvalidInputError
 from tslam_bench.reconstruction.volume import Volume
 
 GRID_SHAPE = (GRID_SIZE,) * 3
+_REMEDY = "give an .npz file with the arrays 'touched' and 'visited'"
 
 
 def check_grid(grid: NDArray, name: str) -> NDArray[np.bool_]:
@@ -43,8 +44,8 @@ def empty_volume() -> Volume:
 def read_grids(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Touched and visited grids of an ``.npz`` file with the arrays ``touched`` and, optionally, ``visited``.
 
-    Each is (32, 32, 32) of 0 and 1, or (4096,) uint8 of packed bits (:func:`tslam_bench.grids.pack`). Without ``visited``,
-    the visited grid is empty.
+    Each is (32, 32, 32) of 0 and 1, or (4096,) uint8 of packed bits (:func:`tslam_bench.grids.pack`). Without
+    ``visited``, the visited grid is empty.
 
     Raises:
         InvalidInputError: the file cannot be read, lacks ``touched``, or an array has another form.
@@ -54,9 +55,9 @@ def read_grids(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             arrays = {name: file[name] for name in ("touched", "visited") if name in file.files}
     except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else "not an .npz file of plain arrays"
-        raise InvalidInputError(f"{path}: {reason}; give an .npz file with the arrays 'touched' and 'visited'") from error
+        raise InvalidInputError(f"{path}: {reason}; {_REMEDY}") from error
     if "touched" not in arrays:
-        raise InvalidInputError(f"{path}: has no array 'touched'; give an .npz file with the arrays 'touched' and 'visited'")
+        raise InvalidInputError(f"{path}: has no array 'touched'; {_REMEDY}")
     arrays.setdefault("visited", np.zeros(GRID_SHAPE, dtype=bool))
     read = []
     for name, array in arrays.items():

@@ -74,7 +74,8 @@ def _stroke(placed: PlacedShape, direction: NDArray, simulation: TouchSimulation
     frame = _frames(direction[None], generator)[0]
     half = WORKSPACE_EDGE / 2
     aim = generator.uniform(-half, half, 3) * 0.7
-    palm = _palm_samples(simulation) @ _frames(_unit(direction + 0.5 * generator.standard_normal(3))[None], generator)[0]
+    facing = _unit(direction + 0.5 * generator.standard_normal(3))
+    palm = _palm_samples(simulation) @ _frames(facing[None], generator)[0]
     start = aim + direction * (1.5 * half - aim @ direction)
     length = generator.uniform(0.5 * half, 2.5 * half)
     drift = 0.3 * generator.standard_normal(2) @ frame[:2]
@@ -102,7 +103,7 @@ def simulate_touches(
     """Explores a placed shape for a random while. May touch fewer voxels than aimed at where little can be reached."""
     simulation = simulation or TouchSimulation()
     low, high = simulation.touched_voxels
-    aimed = int(round(np.exp(generator.uniform(np.log(low), np.log(high)))))
+    aimed = round(float(np.exp(generator.uniform(np.log(low), np.log(high)))))
     directions = _unit(generator.standard_normal((generator.integers(*simulation.approaches, endpoint=True), 3)))
 
     swept = [np.zeros((0, 3))]

@@ -177,8 +177,8 @@ class PlacedShape:
         near_inside = self.shape.near_inside.reshape(-1)
         near, near_inside = _draw_in_workspace(self.to_workspace, near, near_inside, near_count, generator)
 
-        # Uniform in W: a point that falls into the shape's (turned) bounding box is replaced by one of the pool, which is
-        # uniform in that box and has an exact label; everything outside the box is outside the solid.
+        # Uniform in W: a point that falls into the shape's (turned) bounding box is replaced by one of the pool, which
+        # is uniform in that box and has an exact label; everything outside the box is outside the solid.
         uniform = WORKSPACE_LOW + WORKSPACE_EDGE * generator.random((count - near_count, 3))
         local = (uniform - self.translation) @ self.rotation / self.scale
         in_box = (np.abs(local) <= self.shape.half_extents).all(axis=1)

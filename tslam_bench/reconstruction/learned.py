@@ -1,0 +1,211 @@
+"""Learned reconstructors: networks by name, checkpoint files, and the reconstructor that queries a network."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter, zoom
+
+from tslam_bench.constants import GRID_SIZE, OCCUPANCY_THRESHOLD
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import atomic_file
+from tslam_bench.grids import voxel_centres
+from tslam_bench.reconstruction import convonet, ifnet
+from tslam_bench.reconstruction.inputs import check_grids, empty_volume
+from tslam_bench.reconstruction.volume import Volume
+
+CHECKPOINT_FORMAT: Final = "tslam-bench reconstruction network, version 1"
+NETWORKS: Final[dict[str, dict[str, Any]]] = {
+    "ifnet": {"small": ifnet.SMALL, "paper": ifnet.PAPER},
+    "convonet": {"small": convonet.SMALL},
+}
+"""Architectures and their named sizes."""
+_CLASSES: Final[dict[str, tuple[type, type]]] = {
+    "ifnet": (ifnet.IFNet, ifnet.IFNetConfig),
+    "convonet": (convonet.ConvONet, convonet.ConvONetConfig),
+}
+_REMEDY: Final = "train it again with `tslam-bench reconstruct train`"
+
+
+def network_config(architecture: str, size: str) -> Any:
+    """The configuration of a named size. Raises InvalidInputError for an unknown architecture or size."""
+    if architecture not in NETWORKS:
+        raise InvalidInputError(f"architecture {architecture!r}: unknown; choose one of {', '.join(NETWORKS)}")
+    sizes = NETWORKS[architecture]
+    if size not in sizes:
+        raise InvalidInputError(f"{architecture} size {size!r}: unknown; choose one of {', '.join(sizes)}")
+    return sizes[size]
+
+
+def build_network(architecture: str, config: Any, seed: int = 0) -> torch.nn.Module:
+    """A freshly initialised network; the same seed gives the same weights and leaves torch's own generator alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return _CLASSES[architecture][0](config)
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Runs a block with ``count`` torch threads and restores the number afterwards."""
+    if count < 1:
+        raise InvalidInputError(f"threads {count}: choose at least 1")
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, all the way down: the types that a safe checkpoint holds."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def save_checkpoint(
+    path: Path,
+    architecture: str,
+    network: torch.nn.Module,
+    training: dict[str, Any],
+    extra: dict[str, Any] | None = None,
+) -> None:
+    """Writes architecture, configuration, weights and the training record to ``path``, atomically.
+
+    Args:
+        path: file to write.
+        architecture: name in :data:`NETWORKS`.
+        network: the network.
+        training: what it was trained on and for how long; numbers, strings, lists and dicts only.
+        extra: further entries, such as the optimiser's state.
+    """
+    content = {
+        "format": CHECKPOINT_FORMAT,
+        "architecture": architecture,
+        "config": _plain(dataclasses.asdict(network.config)),  # type: ignore[call-overload]
+        "training": _plain(training),
+        "weights": {name: tensor.detach().clone().contiguous() for name, tensor in network.state_dict().items()},
+        **(extra or {}),
+    }
+    with atomic_file(path) as temporary:
+        torch.save(content, temporary)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The content of a checkpoint, read without executing anything in it.
+
+    Raises:
+        InvalidInputError: no such file, or not a checkpoint of this package.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidInputError(f"{path}: no such model; train one with `tslam-bench reconstruct train`")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise InvalidInputError(f"{path}: corrupt, or not a reconstruction model; {_REMEDY}") from error
+    if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
+        raise InvalidInputError(f"{path}: not a {CHECKPOINT_FORMAT}; {_REMEDY}")
+    return content
+
+
+def load_network(path: Path) -> tuple[str, torch.nn.Module, dict[str, Any]]:
+    """Architecture name, network in evaluation mode, and training record of a checkpoint.
+
+    Raises:
+        InvalidInputError: see :func:`read_checkpoint`; also weights that do not fit the configuration.
+    """
+    content = read_checkpoint(path)
+    try:
+        architecture = content["architecture"]
+        config = _CLASSES[architecture][1](**{key: _tuples(value) for key, value in content["config"].items()})
+        network = build_network(architecture, config)
+        network.load_state_dict(content["weights"])
+        training = dict(content["training"])
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+        raise InvalidInputError(f"{path}: weights and configuration do not fit together; {_REMEDY}") from error
+    return architecture, network.eval(), training
+
+
+class LearnedReconstructor:
+    """A trained network, queried over W.
+
+    The network is evaluated on a 32^3 lattice first, then twice as fine wherever the coarse values in the 3^3
+    neighbourhood leave the 0.5 level in reach (between 0.25 and 0.75, or on both sides); elsewhere the fine values are
+    the coarse ones, interpolated. Nothing touched: empty, whatever was visited, since no training example is without a
+    touch and the network's guess there would be arbitrary.
+
+    Args:
+        name: registered name.
+        network: network with ``encode`` and ``decode``, in evaluation mode.
+        training: its training record, for the reports.
+        refine: evaluate at 64^3 near the surface; False keeps the 32^3 lattice.
+        batch_points: query points per pass.
+        threads: torch threads.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        network: torch.nn.Module,
+        training: dict[str, Any] | None = None,
+        refine: bool = True,
+        batch_points: int = 8192,
+        threads: int = 1,
+    ) -> None:
+        self.name = name
+        self.network = network
+        self.training = training or {}
+        self.refine = refine
+        self.batch_points = batch_points
+        self.threads = threads
+
+    def reconstruct(self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]) -> Volume:
+        """Touched and visited grids (32, 32, 32) bool, object frame -> volume with linear interpolation."""
+        touched, visited = check_grids(touched, visited)
+        if not touched.any():
+            return empty_volume()
+        grids = torch.from_numpy(np.stack([touched, visited])[None].astype(np.float32))
+        with torch_threads(self.threads), torch.inference_mode():
+            features = self.network.encode(grids)  # type: ignore[operator]
+            coarse = self._query(features, voxel_centres(GRID_SIZE).reshape(-1, 3)).reshape((GRID_SIZE,) * 3)
+            if not self.refine:
+                return Volume(coarse, "linear")
+            fine = zoom(coarse, 2, order=1, mode="nearest", grid_mode=True)
+            near = (maximum_filter(coarse, 3) > OCCUPANCY_THRESHOLD / 2) & (
+                minimum_filter(coarse, 3) < 1 - OCCUPANCY_THRESHOLD / 2
+            )
+            near = near.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+            fine[near] = self._query(features, voxel_centres(2 * GRID_SIZE)[near])
+        return Volume(np.clip(fine, 0, 1), "linear")
+
+    def _query(self, features: list[torch.Tensor], points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Probabilities (M,) at points (M, 3)."""
+        batches = torch.from_numpy(points.astype(np.float32)).split(self.batch_points)
+        logits = [self.network.decode(features, batch[None])[0] for batch in batches]  # type: ignore[operator]
+        return torch.sigmoid(torch.cat(logits)).numpy() if logits else np.zeros(0, dtype=np.float32)
+
+
+def load_reconstructor(path: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
+    """The reconstructor of a checkpoint.
+
+    Raises:
+        InvalidInputError: see :func:`load_network`; also a checkpoint of another architecture than ``name``.
+    """
+    architecture, network, training = load_network(path)
+    if name is not None and architecture != name:
+        raise InvalidInputError(f"{path}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor")
+    return LearnedReconstructor(architecture, network, training, threads=threads)

@@ -1,0 +1,216 @@
+"""Training of the learned reconstructors on simulated touches.
+
+Every step draws its own examples from a generator seeded by (seed, step): the run is the same whether it was
+interrupted or not, and the same seed gives the same weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as functional
+from numpy.typing import NDArray
+
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import ensure_writable_directory
+from tslam_bench.reconstruction.learned import (
+    LearnedReconstructor,
+    build_network,
+    load_reconstructor,
+    network_config,
+    read_checkpoint,
+    save_checkpoint,
+    torch_threads,
+)
+from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
+from tslam_bench.reconstruction.training_shapes import TrainingShape, place
+
+_EXAMPLE_STREAM: Final = 1  # keeps the examples' generators apart from any other use of the seed
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a reconstructor is trained."""
+
+    architecture: Literal["ifnet", "convonet"] = "ifnet"
+    """Network: ifnet (the paper's) or convonet."""
+    size: Literal["small", "paper"] = "small"
+    """Size of the network; paper is for ifnet on a large machine."""
+    steps: int = 300
+    """Optimiser steps: the whole budget. The learning rate falls to zero at the last one."""
+    batch_size: int = 8
+    """Examples per step, each a shape in a new pose with new touches."""
+    points: int = 512
+    """Labelled query points per example."""
+    learning_rate: float = 2e-3
+    """Adam's learning rate at its peak; it rises over the first 5 % of the steps and falls as a half cosine."""
+    scale_range: tuple[float, float] = (0.8, 1.2)
+    """Every example scales its shape by a factor from this range."""
+    continuous_rotation: bool = False
+    """Turn shapes by any rotation instead of one of the 24 that map axes to axes."""
+    seed: int = 0
+    """Seed of the initial weights and of all examples."""
+    threads: int = 1
+    """Torch threads; another number may change the last bits."""
+    save_every: int = 50
+    """Steps between the checkpoints that a killed run resumes from."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "points", "threads", "save_every"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} {getattr(self, name)}: choose at least 1")
+        if not 0 < self.learning_rate < 1:
+            raise InvalidInputError(f"learning_rate {self.learning_rate}: choose a number between 0 and 1")
+        low, high = self.scale_range
+        if not 0 < low <= high:
+            raise InvalidInputError(f"scale_range {self.scale_range}: choose two positive numbers, the smaller first")
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Training examples: grids (B, 2, 32, 32, 32), points (B, P, 3) in metres, labels (B, P); all float32."""
+
+    grids: NDArray[np.float32]
+    points: NDArray[np.float32]
+    labels: NDArray[np.float32]
+
+
+def draw_batch(
+    shapes: Sequence[TrainingShape],
+    config: TrainingConfig,
+    generator: np.random.Generator,
+    simulation: TouchSimulation | None = None,
+) -> Batch:
+    """Draws ``config.batch_size`` examples."""
+    grids, points, labels = [], [], []
+    for _ in range(config.batch_size):
+        shape = shapes[int(generator.integers(len(shapes)))]
+        placed = place(shape, generator, config.scale_range, config.continuous_rotation)
+        touches = simulate_touches(placed, generator, simulation)
+        example_points, example_labels = placed.query_points(config.points, generator)
+        grids.append(np.stack([touches.touched, touches.visited]).astype(np.float32))
+        points.append(example_points)
+        labels.append(example_labels)
+    return Batch(np.stack(grids), np.stack(points), np.stack(labels))
+
+
+def learning_rate(config: TrainingConfig, step: int) -> float:
+    """Learning rate of step 0, 1, ...: linear rise over the first 5 % of the steps, then a half cosine to zero."""
+    rise = max(1, round(0.05 * config.steps))
+    if step < rise:
+        return config.learning_rate * (step + 1) / rise
+    return config.learning_rate * 0.5 * (1 + float(np.cos(np.pi * (step - rise) / max(1, config.steps - rise))))
+
+
+def train(
+    shapes: Sequence[TrainingShape],
+    config: TrainingConfig,
+    output: Path,
+    log_directory: Path | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    stop: Callable[[int], bool] | None = None,
+) -> LearnedReconstructor | None:
+    """Trains a network and writes it to ``output``.
+
+    While it trains, ``<output>.progress`` holds a checkpoint every ``save_every`` steps; a killed run continues from it
+    and ends with the weights of an uninterrupted one. A finished ``output`` of the same configuration and shapes is
+    loaded, not trained again.
+
+    Args:
+        shapes: shapes to learn from.
+        config: the training configuration.
+        output: checkpoint to write.
+        log_directory: TensorBoard log of the loss, optional.
+        progress: called after each step with the steps done and the loss (nan for those already done on resuming).
+        stop: called after each step with the steps done; returning True saves the progress and ends the run there.
+
+    Returns:
+        The trained reconstructor, or None if ``stop`` ended the run.
+
+    Raises:
+        InvalidInputError: no shapes; or ``output`` or its progress file is of another training run.
+        AssetError: the output folder cannot be written.
+    """
+    if not shapes:
+        raise InvalidInputError("training shapes: none; prepare some with `tslam-bench assets prepare --split train`")
+    output = Path(output)
+    ensure_writable_directory(output.parent)
+    record: dict[str, Any] = {
+        **dataclasses.asdict(config),
+        "scale_range": list(config.scale_range),
+        "objects": [shape.name for shape in shapes],
+    }
+    del record["save_every"]
+    if output.exists():
+        _check_same_run(output, record)
+        return load_reconstructor(output, threads=config.threads)
+
+    partial = output.with_name(output.name + ".progress")
+    network = build_network(config.architecture, network_config(config.architecture, config.size), config.seed)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+    start = 0
+    if partial.exists():
+        _check_same_run(partial, record)
+        content = read_checkpoint(partial)
+        network.load_state_dict(content["weights"])
+        optimizer.load_state_dict(content["optimizer"])
+        start = int(content["steps_done"])
+        if progress:
+            progress(start, float("nan"))
+
+    writer = None
+    if log_directory is not None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        writer = SummaryWriter(str(log_directory), purge_step=start)  # type: ignore[no-untyped-call]
+    network.train()
+    try:
+        with torch_threads(config.threads):
+            for step in range(start, config.steps):
+                loss = _step(network, optimizer, shapes, config, step)
+                done = step + 1
+                if writer is not None:
+                    writer.add_scalar("loss/cross_entropy", loss, done)  # type: ignore[no-untyped-call]
+                if progress:
+                    progress(done, loss)
+                stopped = stop is not None and done < config.steps and stop(done)
+                if stopped or (done % config.save_every == 0 and done < config.steps):
+                    state = {"optimizer": optimizer.state_dict(), "steps_done": done}
+                    save_checkpoint(partial, config.architecture, network, record, state)
+                if stopped:
+                    return None
+    finally:
+        if writer is not None:
+            writer.close()  # type: ignore[no-untyped-call]
+    save_checkpoint(output, config.architecture, network, record)
+    partial.unlink(missing_ok=True)
+    return LearnedReconstructor(config.architecture, network.eval(), record, threads=config.threads)
+
+
+def _step(network, optimizer, shapes, config: TrainingConfig, step: int) -> float:
+    """One optimiser step on fresh examples; returns the loss."""
+    generator = np.random.Generator(np.random.PCG64([config.seed, _EXAMPLE_STREAM, step]))
+    batch = draw_batch(shapes, config, generator)
+    for group in optimizer.param_groups:
+        group["lr"] = learning_rate(config, step)
+    logits = network(torch.from_numpy(batch.grids), torch.from_numpy(batch.points))
+    loss = functional.binary_cross_entropy_with_logits(logits, torch.from_numpy(batch.labels))
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return float(loss.detach())
+
+
+def _check_same_run(path: Path, record: dict[str, Any]) -> None:
+    """Raises InvalidInputError unless the checkpoint at ``path`` belongs to the run that ``record`` describes."""
+    found = read_checkpoint(path)["training"]
+    for key, value in record.items():
+        if found.get(key) != value:
+            detail = "other objects" if key == "objects" else f"{key} {found.get(key)!r}, not {value!r}"
+            raise InvalidInputError(f"{path}: is of another run ({detail}); delete it or choose another output")

@@ -1,0 +1,404 @@
+"""Scores of a submission: every object, seed and protocol, then aggregated (protocol sections 10 and 12).
+
+Rollouts are not replayed: a score says ``verified: false`` until something has simulated the stored actions again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from tslam_bench import __version__, grids
+from tslam_bench.assets.contactdb import OBJECTS
+from tslam_bench.assets.store import PreparedObject, asset_sha256, load_object, resolve_name
+from tslam_bench.constants import (
+    F_SCORE_DISTANCES,
+    GRID_SIZE,
+    HORIZON,
+    PROTOCOL_POSES,
+    PROTOCOL_VERSION,
+    QUICK_OBJECTS,
+    VOXEL_EDGE,
+)
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.leaderboard import metrics
+from tslam_bench.leaderboard.aggregate import Estimate, estimate_all
+from tslam_bench.leaderboard.info import SubmissionInfo, parse_info
+from tslam_bench.leaderboard.prediction import prepare
+from tslam_bench.leaderboard.submission import (
+    EXPLORATION_ORDER,
+    RECONSTRUCTED_POSES,
+    Reconstruction,
+    Rollout,
+    Submission,
+    read_submission,
+)
+from tslam_bench.sampling import iou_points
+
+SCORE_VERSION: Final = 1
+"""Version of the score file's layout."""
+CURVE_SPACING: Final = 10
+"""Control steps between the stored samples of an exploration curve."""
+VOXEL_HALF_DIAGONAL: Final = VOXEL_EDGE * np.sqrt(3) / 2
+PLAUSIBLE_SLACK: Final = 2e-3
+"""A touched voxel holds a contact point, which lies on the collision hulls; this much (m) is allowed for the error of the
+field and for the linear step from probe to surface."""
+
+SHAPE_METRICS: Final = {
+    "iou": 0.0,
+    "iou_raw": 0.0,
+    "chamfer_l2": metrics.WORST_DISTANCE**2,
+    "chamfer_l1": metrics.WORST_DISTANCE,
+    "normal_consistency": 0.0,
+    "f_score_1": 0.0,
+    "f_score_2": 0.0,
+}
+"""Metrics of a reconstruction -> worst value, which an empty prediction is given. Metric units, squared or plain."""
+TOUCH_METRICS: Final = ("surface_iou", "touched_surface_recall")
+"""Metrics of the merged touched voxels."""
+EXPLORATION_METRICS: Final = ("exploration_area", "exploration_surface_iou_area")
+"""Areas under the curves of recall and of surface IoU over all eight poses."""
+LOWER_IS_BETTER: Final = ("chamfer_l2", "chamfer_l1")
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Ground truth of one object with what is computed once for all submissions."""
+
+    prepared: PreparedObject
+    surface: NDArray[np.float64]
+    tree: cKDTree
+    coverage: metrics.TouchCoverage
+
+    @staticmethod
+    def of(prepared: PreparedObject) -> Truth:
+        """Ground truth from a prepared object."""
+        surface = metrics.to_metric(prepared.surface_points)
+        return Truth(prepared, surface, cKDTree(surface), metrics.TouchCoverage(prepared.surface_points))
+
+
+@lru_cache(maxsize=8)
+def load_truth(name: str, cache: Path | None = None) -> Truth:
+    """Ground truth of a test object from the asset cache."""
+    return Truth.of(load_object(name, cache=cache))
+
+
+@dataclass(frozen=True)
+class ObjectScore:
+    """Scores of one object and seed.
+
+    Attributes:
+        object, seed: what was scored.
+        protocols: ``"4"`` and ``"8"`` -> metric -> value; touch metrics are None for a reference without rollouts.
+        reasons: ``"4"`` and ``"8"`` -> why the reconstruction counts as empty, or None.
+        poses: ``"1"``, ``"2"``, ``"4"``, ``"8"`` -> recall and surface IoU after so many poses of the exploration order,
+            and IoU where a reconstruction is there.
+        recall_curve, surface_iou_curve: values every ``CURVE_SPACING`` control steps over all eight poses, from step 0.
+        exploration: areas under the two curves (from every step).
+        implausible_touches: share of touched voxels that cannot hold a point of the object's surface.
+        missing: files of the protocols that the submission lacks.
+    """
+
+    object: str
+    seed: int
+    protocols: dict[str, dict[str, float | None]]
+    reasons: dict[str, str | None]
+    poses: dict[str, dict[str, float | None]]
+    recall_curve: list[float]
+    surface_iou_curve: list[float]
+    exploration: dict[str, float | None]
+    implausible_touches: float
+    missing: list[str]
+
+
+@dataclass(frozen=True)
+class SubmissionScore:
+    """Scores of a submission.
+
+    Attributes:
+        info: what the submission says about itself.
+        content_hash: SHA-256 of its files.
+        objects: names, in the order of scoring.
+        results: one per object and seed.
+        aggregate: ``"4"``, ``"8"`` and ``"exploration"`` -> metric -> estimate over objects and seeds.
+        notes: one line each: what a reader of the figures should know.
+        verified: whether its rollouts were replayed and reproduced.
+    """
+
+    info: SubmissionInfo
+    content_hash: str
+    objects: tuple[str, ...]
+    results: tuple[ObjectScore, ...]
+    aggregate: dict[str, dict[str, Estimate]]
+    notes: tuple[str, ...]
+    verified: bool = False
+
+    def matrix(self, metric: str, protocol: int) -> NDArray[np.float64]:
+        """Values of one metric: (objects, seeds)."""
+        values = [result.protocols[str(protocol)][metric] for result in self.results]
+        return np.array(values, dtype=np.float64).reshape(len(self.objects), -1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for a score file."""
+        return {
+            "score_version": SCORE_VERSION,
+            "protocol_version": PROTOCOL_VERSION,
+            "package_version": __version__,
+            "submission": self.info.to_json(),
+            "content_hash": self.content_hash,
+            "verified": self.verified,
+            "objects": list(self.objects),
+            "results": [dataclasses.asdict(result) for result in self.results],
+            "aggregate": {
+                group: {name: dataclasses.asdict(estimate) for name, estimate in estimates.items()}
+                for group, estimates in self.aggregate.items()
+            },
+            "notes": list(self.notes),
+        }
+
+    @staticmethod
+    def from_json(value: Any, where: str) -> SubmissionScore:
+        """Reads a score file's content. Raises InvalidInputError if it is not one of this version."""
+        try:
+            if value["score_version"] != SCORE_VERSION or value["protocol_version"] != PROTOCOL_VERSION:
+                raise InvalidInputError(f"{where}: score file of another version; score the submission again")
+            return SubmissionScore(
+                info=parse_info(json.dumps(value["submission"]).encode()),
+                content_hash=str(value["content_hash"]),
+                objects=tuple(value["objects"]),
+                results=tuple(ObjectScore(**result) for result in value["results"]),
+                aggregate={
+                    group: {name: Estimate(**estimate) for name, estimate in estimates.items()}
+                    for group, estimates in value["aggregate"].items()
+                },
+                notes=tuple(value["notes"]),
+                verified=bool(value["verified"]),
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InvalidInputError(f"{where}: not a score file ({error}); score the submission again") from error
+
+
+def score_submission(
+    path: Path | str,
+    objects: Sequence[str] | None = None,
+    workers: int = 1,
+    on_progress: Callable[[int, int], None] | None = None,
+    cache: Path | None = None,
+) -> SubmissionScore:
+    """Scores a submission against the prepared objects of the asset cache.
+
+    Args:
+        path: folder or zip archive.
+        objects: names to score; by default those of the submission's object set.
+        workers: processes that score objects; the result does not depend on it.
+        on_progress: called with (done, all) objects.
+        cache: asset cache; by default the user's.
+
+    Raises:
+        InvalidInputError: the submission is refused, or an object is unknown.
+        AssetError: an object is not prepared.
+    """
+    submission = read_submission(path)
+    names = tuple(dict.fromkeys(resolve_name(name) for name in (objects or object_set(submission.info.object_set))))
+    results: list[ObjectScore] = []
+    for done, scores in enumerate(_score_all(submission, Path(path), names, workers, cache), start=1):
+        results += scores
+        if on_progress:
+            on_progress(done, len(names))
+    return SubmissionScore(
+        info=submission.info,
+        content_hash=submission.content_hash,
+        objects=names,
+        results=tuple(results),
+        aggregate=aggregate(results, len(names)),
+        notes=_notes(submission, results, names, cache),
+    )
+
+
+def object_set(name: str) -> tuple[str, ...]:
+    """Objects of ``"quick"`` or ``"test"``."""
+    return QUICK_OBJECTS if name == "quick" else tuple(sorted(OBJECTS))
+
+
+def _score_all(
+    submission: Submission, path: Path, names: Sequence[str], workers: int, cache: Path | None
+) -> Iterator[list[ObjectScore]]:
+    if workers <= 1 or len(names) == 1:
+        for name in names:
+            yield score_object(submission, load_truth(name, cache))
+        return
+    # spawn: a forked copy of a process whose libraries have started threads may hang
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(names)), mp_context=context) as pool:
+        yield from pool.map(_score_in_process, [path] * len(names), names, [cache] * len(names))
+
+
+def _score_in_process(path: Path, name: str, cache: Path | None) -> list[ObjectScore]:
+    return score_object(read_submission(path, check=False), load_truth(name, cache))
+
+
+def score_object(submission: Submission, truth: Truth) -> list[ObjectScore]:
+    """Scores of one object, one per seed of the submission."""
+    return [_score_seed(submission, truth, seed) for seed in submission.info.seeds]
+
+
+def _score_seed(submission: Submission, truth: Truth, seed: int) -> ObjectScore:
+    name = truth.prepared.name
+    rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
+    reference = submission.info.privileged and not any(rollouts.values())
+    missing = [] if reference else [f"rollout of pose {pose}" for pose, rollout in rollouts.items() if rollout is None]
+    touched_step = merge_touched_steps(rollouts)
+
+    protocols, reasons, poses = {}, {}, {}
+    for count, members in RECONSTRUCTED_POSES.items():
+        steps = np.where(touched_step < count * HORIZON, touched_step, -1)
+        touch: dict[str, float | None] = {
+            "surface_iou": metrics.surface_iou(steps >= 0, truth.prepared.surface),
+            "touched_surface_recall": truth.coverage.recall(steps >= 0),
+        }
+        if reference:
+            touch = dict.fromkeys(touch)
+        reconstruction = submission.reconstruction(name, count, seed)
+        absent = [pose for pose in members if rollouts[pose] is None]
+        shape: dict[str, float | None] = {}
+        if count in PROTOCOL_POSES:
+            reason = None
+            if reconstruction is None:
+                missing.append(f"reconstruction of {count} poses")
+            elif absent and not reference:
+                reason = f"rollouts of poses {', '.join(map(str, absent))} are missing"
+                reconstruction = None
+            values, found = score_reconstruction(reconstruction, truth)
+            shape = dict(values)
+            protocols[str(count)], reasons[str(count)] = {**shape, **touch}, reason or found
+        elif reconstruction is not None and not absent:
+            solid = prepare(reconstruction, iou_points(), samples=0).solid
+            shape = {"iou": metrics.iou(solid, truth.prepared.solid_at_iou_points)}
+        poses[str(count)] = {**touch, "iou": shape.get("iou")}
+
+    total = HORIZON * len(EXPLORATION_ORDER)
+    recall = truth.coverage.recall_curve(touched_step, total)
+    surface = metrics.surface_iou_curve(touched_step, truth.prepared.surface, total)
+    areas: dict[str, float | None] = {
+        "exploration_area": metrics.area_under_curve(recall),
+        "exploration_surface_iou_area": metrics.area_under_curve(surface),
+    }
+    return ObjectScore(
+        object=name,
+        seed=seed,
+        protocols=protocols,
+        reasons=reasons,
+        poses=poses,
+        recall_curve=[] if reference else [round(float(x), 5) for x in recall[::CURVE_SPACING]],
+        surface_iou_curve=[] if reference else [round(float(x), 5) for x in surface[::CURVE_SPACING]],
+        exploration=dict.fromkeys(areas) if reference else areas,
+        implausible_touches=implausible_touches(touched_step >= 0, truth.prepared),
+        missing=missing,
+    )
+
+
+def score_reconstruction(reconstruction: Reconstruction | None, truth: Truth) -> tuple[dict[str, float], str | None]:
+    """Shape metrics of one reconstruction, and why it counts as empty (or None)."""
+    prepared = truth.prepared
+    prediction = prepare(reconstruction, iou_points())
+    if prediction.reason is not None:
+        return dict(SHAPE_METRICS), prediction.reason
+    match = metrics.match_surfaces(metrics.to_metric(prediction.points), truth.surface, truth.tree)
+    return {
+        "iou": metrics.iou(prediction.solid, prepared.solid_at_iou_points),
+        "iou_raw": metrics.iou(prediction.solid, prepared.raw_solid_at_iou_points),
+        "chamfer_l2": metrics.chamfer_l2(match),
+        "chamfer_l1": metrics.chamfer_l1(match),
+        "normal_consistency": metrics.normal_consistency(prediction.normals, prepared.surface_normals, match),
+        "f_score_1": metrics.f_score(match, F_SCORE_DISTANCES[0]),
+        "f_score_2": metrics.f_score(match, F_SCORE_DISTANCES[1]),
+    }, None
+
+
+def merge_touched_steps(rollouts: dict[int, Rollout | None]) -> NDArray[np.int64]:
+    """First step at which each voxel was touched, in the object frame, over the poses one after the other.
+
+    Args:
+        rollouts: pose -> rollout (its grids in the world frame of that pose) in the order of exploration; a missing one
+            takes its 200 steps and touches nothing.
+
+    Returns:
+        (32, 32, 32) steps from 0 to 200 times the poses, -1 for never.
+    """
+    never = np.iinfo(np.int64).max
+    first = np.full((GRID_SIZE,) * 3, never)
+    for position, (pose, rollout) in enumerate(rollouts.items()):
+        if rollout is not None:
+            steps = grids.world_to_object(rollout.touched_step, pose).astype(np.int64)
+            first = np.minimum(first, np.where(steps >= 0, steps + position * HORIZON, never))
+    return np.where(first == never, -1, first)
+
+
+def implausible_touches(touched: NDArray[np.bool_], prepared: PreparedObject) -> float:
+    """Share of touched voxels (object frame) too far from the collision hulls to hold a contact point; 0 if none.
+
+    A necessary condition, not a proof: a contact point is on the hulls' surface, so the signed distance at its voxel's
+    centre is at most half the voxel's diagonal.
+    """
+    centres = grids.voxel_centres()[touched]
+    if len(centres) == 0:
+        return 0.0
+    field = prepared.field
+    index = (centres - field.origin) / field.spacing
+    distance = map_coordinates(field.values, index.T, order=1, mode="constant", cval=np.inf, prefilter=False)
+    limit = VOXEL_HALF_DIAGONAL + PLAUSIBLE_SLACK
+    # Outside the field's padding (inf or the nan that interpolation makes of it) is too far in any case.
+    return float(np.mean(~(np.abs(distance) <= limit)))
+
+
+def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:
+    """Estimates over objects and seeds of results in the order object by object, seed by seed."""
+    groups: dict[str, dict[str, NDArray]] = {}
+    rows = {
+        **{str(count): [result.protocols[str(count)] for result in results] for count in PROTOCOL_POSES},
+        "exploration": [result.exploration for result in results],
+    }
+    for group, values in rows.items():
+        groups[group] = {
+            name: np.array([row[name] for row in values], dtype=np.float64).reshape(objects, -1)
+            for name in values[0]
+            if all(row[name] is not None for row in values)
+        }
+    return {group: estimate_all(values) for group, values in groups.items()}
+
+
+def _notes(
+    submission: Submission, results: Sequence[ObjectScore], names: Sequence[str], cache: Path | None
+) -> tuple[str, ...]:
+    notes = []
+    if tuple(names) != object_set(submission.info.object_set):
+        notes.append(f"scored on {len(names)} chosen objects, not on the object set {submission.info.object_set!r}")
+    for result in results:
+        where = f"{result.object}, seed {result.seed}"
+        if result.missing:
+            notes.append(f"{where}: counted as empty, missing: {', '.join(result.missing)}")
+        for protocol, reason in result.reasons.items():
+            if reason is not None and reason != "missing":
+                notes.append(f"{where}, {protocol} poses: counted as empty, {reason}")
+        if result.implausible_touches > 0:
+            share = f"{100 * result.implausible_touches:.1f} %"
+            notes.append(f"{where}: {share} of the touched voxels are too far from the object to hold a contact")
+    try:
+        own = asset_sha256(object_set(submission.info.object_set), cache=cache)
+        if own != submission.info.asset_manifest_sha256:
+            notes.append("the rollouts were made with other assets than the ones scored against")
+    except AssetError:
+        notes.append("the asset hash was not compared: not every object of the set is prepared here")
+    return tuple(notes)

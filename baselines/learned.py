@@ -2,24 +2,53 @@
 
 from __future__ import annotations
 
+import io
+import json
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 
 from tslam_bench.baselines.interface import check_observation, episode_generators
+from tslam_bench.baselines.network import NETWORKS, policy_arguments
 from tslam_bench.baselines.registry import BaselineSpec
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import JOINT_LIMITS
 
-MODEL_FILE = "model.zip"
-"""The stable-baselines3 archive of a finished model. Loading one runs code it contains: load only models you trust."""
-METADATA_FILE = "model.json"
+MODEL_FILE: Final = "model.zip"
+"""stable-baselines3's archive of a finished model. ``PPO.load`` runs code in it; :func:`read_policy` does not."""
+METADATA_FILE: Final = "model.json"
 """Written last: a model directory without it is unfinished."""
+
+
+def build_policy(metadata: Mapping[str, Any]) -> MultiInputActorCriticPolicy:
+    """An untrained policy of the sizes that a model's metadata states."""
+    entries: dict[str, spaces.Space] = {
+        key: spaces.Box(-np.inf, np.inf, tuple(shape), np.float32) for key, shape in metadata["observations"].items()
+    }
+    limits = tuple((float(low), float(high)) for low, high in JOINT_LIMITS)
+    return MultiInputActorCriticPolicy(
+        spaces.Dict(entries),
+        spaces.Box(-1, 1, (NUM_JOINTS,), np.float32),
+        lr_schedule=lambda _: 0.0,
+        **policy_arguments(NETWORKS[metadata["config"]["network"]], limits),
+    )
+
+
+def read_policy(directory: Path) -> MultiInputActorCriticPolicy:
+    """The policy in a finished model's directory. Reads its weights only: a stranger's model cannot run code."""
+    policy = build_policy(json.loads((directory / METADATA_FILE).read_text(encoding="utf-8")))
+    with zipfile.ZipFile(directory / MODEL_FILE) as archive:
+        weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
+    policy.load_state_dict(weights)
+    return policy
 
 
 class LearnedBaseline:
@@ -29,8 +58,8 @@ class LearnedBaseline:
     standing still, so sampling, which is also what was optimised, is the default.
     """
 
-    def __init__(self, model: PPO, deterministic: bool = False) -> None:
-        self._policy = model.policy
+    def __init__(self, policy: MultiInputActorCriticPolicy, deterministic: bool = False) -> None:
+        self._policy = policy
         self._policy.set_training_mode(False)
         self._deterministic = deterministic
         self._generators: list[np.random.Generator] = []
@@ -54,13 +83,13 @@ class LearnedBaseline:
         if not (directory / METADATA_FILE).is_file() or not (directory / MODEL_FILE).is_file():
             raise InvalidInputError(f"{directory}: holds no finished model of {spec.id!r}; train it: {command}")
         try:
-            model = PPO.load(directory / MODEL_FILE, device="cpu")
-        except Exception as error:  # a damaged archive fails in zipfile, pickle or torch
+            policy = read_policy(directory)
+        except Exception as error:  # damaged files fail in json, zipfile, pickle or torch
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InvalidInputError(
                 f"{directory / MODEL_FILE}: cannot be read ({reason}); train it again: {command}"
             ) from error
-        return cls(model, deterministic)
+        return cls(policy, deterministic)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""

@@ -85,7 +85,12 @@ class GridAndJointsExtractor(BaseFeaturesExtractor):
         width = grid_shape[0]
         for out, kernel, stride in zip(channels, kernels, strides, strict=True):
             padding = (kernel - 1) // 2 if kernel % 2 else 0
-            layers += [nn.Conv3d(width, out, kernel, stride, padding), nn.ReLU()]
+            convolution = nn.Conv3d(width, out, kernel, stride, padding)
+            # stable-baselines3 leaves 3D convolutions at torch's default, whose gain below 1 lets a sparse grid fade
+            # to nothing over six layers.
+            nn.init.orthogonal_(convolution.weight, 2**0.5)
+            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+            layers += [convolution, nn.ReLU()]
             width = out
         convolutions = nn.Sequential(*layers, nn.Flatten())
         with torch.no_grad():

@@ -28,7 +28,7 @@ class Rollout:
         object, pose, seed: what was explored; the episode's seed is ``episode_seed(object, pose, seed)``.
         actions: (200, 28) float32.
         touched, visited: (32, 32, 32) bool, world frame, at the end.
-        touched_step: (32, 32, 32) int16, step in which a voxel was first touched, -1 never; world frame.
+        touched_step: (32, 32, 32) int16, control step (0 = first) of a voxel's first touch, -1 never; world frame.
         episode_return: sum of the environment's reward.
     """
 
@@ -116,6 +116,8 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         if bool(terminated) or bool(truncated) != (step == HORIZON - 1):
             raise InvalidInputError(f"environment: the episode ended after {step + 1} steps, expected {HORIZON}")
     base = env.unwrapped
+    touched_step = to_numpy(base.touched_step)[0].astype(np.int16)  # type: ignore[attr-defined]
+    touched_step[touched_step > 0] -= 1  # the environment counts from 1, submissions from 0
     return Rollout(
         object_name,
         pose,
@@ -123,6 +125,6 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         actions,
         to_numpy(base.touched)[0].astype(bool),  # type: ignore[attr-defined]
         to_numpy(base.visited)[0].astype(bool),  # type: ignore[attr-defined]
-        to_numpy(base.touched_step)[0].astype(np.int16),  # type: ignore[attr-defined]
+        touched_step,
         episode_return,
     )

@@ -15,13 +15,13 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -31,87 +31,14 @@ import tslam_bench
 from tslam_bench.baselines.learned import METADATA_FILE, MODEL_FILE
 from tslam_bench.baselines.network import NETWORKS, policy_arguments
 from tslam_bench.baselines.registry import get_baseline
+from tslam_bench.baselines.training_config import PAPER_STEPS, TrainingConfig
 from tslam_bench.baselines.vector import TactileVecEnv
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON
+from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_directory, atomic_file, ensure_writable_directory, write_json
+from tslam_bench.hand_constants import JOINT_LIMITS
 
-PAPER_STEPS: Final = 10_000_000
-"""Training budget of the paper, in environment steps."""
 CHECKPOINT_STATE: Final = "state.json"
-
-
-@dataclass(frozen=True)
-class TrainingConfig:
-    """Settings of one training run."""
-
-    baseline: str
-    """Id of a learned baseline; it decides the reward."""
-    steps: int = PAPER_STEPS
-    """Environment steps over all environments; rounded up to whole PPO iterations (num_envs * rollout_steps)."""
-    seed: int = 0
-    """Seeds weights, exploration, minibatches, and the objects and poses that are drawn."""
-    num_envs: int = 8
-    """Environments that are stepped side by side."""
-    split: str = "train"
-    """Objects to train on; the test split is refused."""
-    objects: tuple[str, ...] = ()
-    """Restricts training to these objects of the split; empty: all of it."""
-    network: Literal["small", "paper"] = "paper"
-    """Size of the policy network."""
-    rollout_steps: int = 2 * HORIZON
-    """Steps per environment and PPO iteration."""
-    batch_size: int = 400
-    """Minibatch size (samples)."""
-    epochs: int = 5
-    """Passes over each iteration's samples."""
-    learning_rate: float = 3e-4
-    """Adam's step size."""
-    gamma: float = 0.99
-    """Discount (paper: 0.99)."""
-    gae_lambda: float = 0.95
-    """Decay of generalised advantage estimation."""
-    clip_range: float = 0.2
-    """PPO's clip of the probability ratio."""
-    entropy_coefficient: float = 0.0
-    """Weight of the entropy bonus."""
-    checkpoint_every: int = 64_000
-    """Steps between checkpoints; rounded up to whole PPO iterations."""
-    torch_threads: int = 1
-    """Threads of torch. One is fastest on CPUs: with two, the learner was measured more than ten times slower."""
-
-    def __post_init__(self) -> None:
-        spec = get_baseline(self.baseline)
-        if spec.kind != "learned":
-            raise InvalidInputError(f"baseline {self.baseline!r}: is {spec.kind}, there is nothing to train")
-        for name in ("steps", "num_envs", "rollout_steps", "batch_size", "epochs", "checkpoint_every", "torch_threads"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
-        if self.seed < 0:
-            raise InvalidInputError(f"seed {self.seed}: must not be negative")
-        if self.num_envs * self.rollout_steps < 2:
-            raise InvalidInputError("rollout_steps: num_envs * rollout_steps must be at least 2")
-        if not 0 < self.gamma <= 1 or not 0 <= self.gae_lambda <= 1 or self.learning_rate <= 0:
-            raise InvalidInputError("gamma and gae_lambda must lie in (0, 1] and [0, 1], learning_rate above 0")
-        if self.split == "test":
-            raise InvalidInputError("split 'test': baselines are trained on the train split only; choose 'train'")
-        if self.network not in NETWORKS:
-            raise InvalidInputError(f"network {self.network!r}: unknown; choose one of {', '.join(NETWORKS)}")
-
-    @property
-    def iteration_steps(self) -> int:
-        """Environment steps of one PPO iteration."""
-        return self.num_envs * self.rollout_steps
-
-    @property
-    def total_steps(self) -> int:
-        """``steps`` rounded up to whole iterations."""
-        return -(-self.steps // self.iteration_steps) * self.iteration_steps
-
-    @property
-    def chunk_steps(self) -> int:
-        """``checkpoint_every`` rounded up to whole iterations."""
-        return -(-self.checkpoint_every // self.iteration_steps) * self.iteration_steps
 
 
 def train(
@@ -132,9 +59,10 @@ def train(
         Metadata: settings, steps, seconds, mean return of the last episodes, machine, versions, command.
 
     Raises:
-        InvalidInputError: ``output`` holds a run with other settings.
+        InvalidInputError: a setting is unusable, or ``output`` holds a run with other settings.
         AssetError: ``output`` cannot be written, or the split is not prepared.
     """
+    config.check()
     output = Path(output)
     metadata_path = output / METADATA_FILE
     if metadata_path.is_file():
@@ -156,6 +84,8 @@ def train(
         gamma=config.gamma,
         clip_reward=np.inf,
     )
+    space = normalised.observation_space
+    assert isinstance(space, spaces.Dict)
     try:
         if checkpoint is None or state is None:
             model = _new_model(config, normalised)
@@ -191,6 +121,7 @@ def train(
         "seed": config.seed,
         "seconds": round(seconds, 1),
         "mean_return": mean_return,
+        "observations": {key: list(entry.shape or ()) for key, entry in space.spaces.items()},
         "machine": machine_description(),
         "versions": {
             "tslam_bench": tslam_bench.__version__,
@@ -238,8 +169,6 @@ class _Progress(BaseCallback):
 
 
 def _new_model(config: TrainingConfig, environments: VecNormalize) -> PPO:
-    from tslam_bench.tasks.hand_constants import JOINT_LIMITS
-
     limits = tuple((float(low), float(high)) for low, high in np.asarray(JOINT_LIMITS))
     return PPO(
         "MultiInputPolicy",

@@ -1,0 +1,275 @@
+"""Evaluates one explorer: episodes, merged grids, reconstructions, submissions (protocol sections 6, 9 and 12).
+
+Layout below the output folder::
+
+    rollouts/<explorer>/source.json
+    rollouts/<explorer>/<object>/pose<k>_seed<s>.npz
+    submissions/<explorer>-<reconstructor>/
+
+Every file is written whole or not at all and is not made again, so a run that was killed goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+import tslam_bench
+from tslam_bench.assets.store import asset_sha256, known_names, load_object, resolve_name
+from tslam_bench.baselines.learned import METADATA_FILE, MODEL_FILE
+from tslam_bench.baselines.registry import BaselineSpec, get_baseline, make_baseline
+from tslam_bench.baselines.rollout import Rollout, roll_out
+from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
+from tslam_bench.grids import merge, world_to_object
+from tslam_bench.leaderboard.info import SubmissionInfo, Training
+from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, SubmissionWriter
+from tslam_bench.reconstruction.grid import GridReconstructor
+from tslam_bench.reconstruction.hull import HullReconstructor
+from tslam_bench.reconstruction.volume import Reconstructor
+
+SOURCE_FILE: Final = "source.json"
+Grid = NDArray[np.bool_]
+Grids = tuple[Grid, Grid]
+"""Touched and visited."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What to evaluate.
+
+    Attributes:
+        baseline: registered id.
+        objects: objects of the test split; aliases are resolved.
+        seeds: repetitions; each is 8 episodes per object.
+        object_set: ``quick`` or ``test``: which ranking the submissions are for.
+        model: directory of the trained model of a learned baseline.
+        deterministic: a learned baseline acts by the mean of its policy.
+        label: remark that is shown beside every figure of the submission.
+    """
+
+    baseline: str
+    objects: tuple[str, ...]
+    seeds: tuple[int, ...] = (0,)
+    object_set: Literal["quick", "test"] = "test"
+    model: Path | None = None
+    deterministic: bool = False
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        get_baseline(self.baseline)
+        if not self.objects or not self.seeds:
+            raise InvalidInputError("evaluation: give at least one object and one seed")
+        if min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
+            raise InvalidInputError(f"seeds {list(self.seeds)}: must be different and not negative")
+        object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name) for name in self.objects)))
+
+
+def default_objects(object_set: str) -> tuple[str, ...]:
+    """Objects of an object set: the five quick ones, or the test split."""
+    return QUICK_OBJECTS if object_set == "quick" else tuple(known_names("test"))
+
+
+def make_reconstructor(name: str, model: Path | None) -> Reconstructor:
+    """One reconstructor by id; see :func:`make_reconstructors`."""
+    if name in ("grid", "hull") and model is None:
+        return GridReconstructor() if name == "grid" else HullReconstructor()
+    if name in ("ifnet", "convonet") and model is not None:
+        from tslam_bench.reconstruction.learned import load_reconstructor
+
+        return load_reconstructor(model)
+    raise InvalidInputError(
+        f"reconstructor {name!r}: unknown, or its model is missing; give grid, hull, or ifnet=MODEL"
+    )
+
+
+def make_reconstructors(specifications: Sequence[str]) -> dict[str, Reconstructor]:
+    """Reconstructors by id, from ``ID`` or, for those that have learned, ``ID=MODEL``; ``none`` alone gives none.
+
+    Raises:
+        InvalidInputError: unknown id, a model that is missing or unreadable, or one id twice.
+    """
+    if tuple(specifications) == ("none",):
+        return {}
+    reconstructors: dict[str, Reconstructor] = {}
+    for specification in specifications:
+        name, _, model = specification.partition("=")
+        if name in reconstructors:
+            raise InvalidInputError(f"reconstructor {name!r}: given twice")
+        reconstructors[name] = make_reconstructor(name, Path(model) if model else None)
+    return reconstructors
+
+
+def evaluate(
+    config: EvaluationConfig,
+    reconstructors: Mapping[str, Reconstructor],
+    output: Path,
+    on_progress: Callable[[str, int, int], None] | None = None,
+) -> list[Path]:
+    """Explores every object in all 8 poses, reconstructs from 1, 2, 4 and 8 merged poses, and writes one submission per
+    reconstructor.
+
+    Args:
+        config: what to evaluate.
+        reconstructors: by id.
+        output: folder of the run.
+        on_progress: called with (stage, done, total) after each episode and each object.
+
+    Returns:
+        The submissions' folders.
+
+    Raises:
+        InvalidInputError: a model is missing, or ``output`` holds episodes of another model.
+        AssetError: an object is not prepared, or ``output`` cannot be written.
+    """
+    spec = get_baseline(config.baseline)
+    report = on_progress or (lambda stage, done, total: None)
+    folder = output / "rollouts" / spec.id
+    if spec.kind != "reference":
+        explore(config, folder, report)
+    submissions = []
+    for name, reconstructor in reconstructors.items():
+        submission = output / "submissions" / f"{spec.id}-{name}"
+        with SubmissionWriter(submission, submission_info(config, name)) as writer:
+            total = len(config.objects) * len(config.seeds)
+            for done, (object_name, seed) in enumerate(_repetitions(config)):
+                _add_object(writer, spec, folder, reconstructor, object_name, seed)
+                report(f"reconstruct {name}", done + 1, total)
+        submissions.append(submission)
+    return submissions
+
+
+def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, int], None]) -> None:
+    """Rolls out every episode that ``folder`` lacks.
+
+    Raises:
+        InvalidInputError: ``folder`` holds episodes of another model or of other assets.
+    """
+    baseline = make_baseline(config.baseline, config.model, config.deterministic)
+    source = _source(config)
+    path = ensure_writable_directory(folder) / SOURCE_FILE
+    if path.is_file() and json.loads(path.read_text(encoding="utf-8")) != source:
+        raise InvalidInputError(
+            f"{folder}: holds episodes of another model or of other assets; delete it or move it away"
+        )
+    write_json(path, source)
+    episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
+    missing = [e for e in episodes if not episode_path(folder, *e).is_file()]
+    report("explore", len(episodes) - len(missing), len(episodes))
+    if not missing:
+        return
+    env = gym.make(ENVIRONMENT_ID, split="test", render_backend="none")
+    try:
+        for done, (name, pose, seed) in enumerate(missing, start=len(episodes) - len(missing) + 1):
+            roll_out(env, baseline, name, pose, seed).save(episode_path(folder, name, pose, seed))
+            report("explore", done, len(episodes))
+    finally:
+        env.close()
+
+
+def episode_path(folder: Path, object_name: str, pose: int, seed: int) -> Path:
+    """Where an episode lies below an explorer's folder."""
+    return folder / object_name / f"pose{pose}_seed{seed}.npz"
+
+
+def merged_grids(rollouts: Sequence[Rollout]) -> Grids:
+    """Touched and visited of several poses of one object, carried into the object frame and united."""
+    touched = merge(world_to_object(rollout.touched, rollout.pose) for rollout in rollouts)
+    visited = merge(world_to_object(rollout.visited, rollout.pose) for rollout in rollouts)
+    return touched, visited
+
+
+def reference_grids(identifier: str, object_name: str) -> Grids:
+    """Grids of a reference explorer in the object frame.
+
+    ``oracle``: every voxel that the true surface crosses is touched, every voxel whose centre is outside is visited.
+    ``nothing``: both empty.
+    """
+    if identifier == "nothing":
+        return np.zeros((GRID_SIZE,) * 3, dtype=bool), np.zeros((GRID_SIZE,) * 3, dtype=bool)
+    prepared = load_object(object_name)
+    return prepared.surface.copy(), ~prepared.solid
+
+
+def submission_info(config: EvaluationConfig, reconstructor: str) -> SubmissionInfo:
+    """What the submission says about itself; budget and hardware come from the model's metadata."""
+    spec = get_baseline(config.baseline)
+    training = Training()
+    if spec.kind == "learned" and config.model is not None:
+        metadata = _model_metadata(config.model)
+        machine = metadata["machine"]
+        training = Training(
+            steps=int(metadata["steps"]),
+            wall_time_hours=float(metadata["seconds"]) / 3600,
+            hardware=f"{machine['processor']}, {machine['cores']} cores",
+        )
+    return SubmissionInfo(
+        method=f"{spec.id} + {reconstructor}",
+        explorer=spec.id,
+        reconstructor=reconstructor,
+        authors=("The tslam-bench authors",),
+        asset_manifest_sha256=asset_sha256(config.objects),
+        seeds=config.seeds,
+        object_set=config.object_set,
+        privileged=spec.privileged,
+        package_version=tslam_bench.__version__,
+        reward_mode=spec.reward_mode,
+        training=training,
+        label=config.label,
+    )
+
+
+def _add_object(
+    writer: SubmissionWriter,
+    spec: BaselineSpec,
+    folder: Path,
+    reconstructor: Reconstructor,
+    object_name: str,
+    seed: int,
+) -> None:
+    """Adds one object's rollouts and reconstructions, those that are not there yet."""
+    missing = [n for n in RECONSTRUCTED_POSES if not writer.has_reconstruction(object_name, n, seed)]
+    if spec.kind == "reference":
+        if missing:
+            volume = reconstructor.reconstruct(*reference_grids(spec.id, object_name))
+            for count in missing:
+                writer.add_reconstruction(object_name, count, seed, volume)
+        return
+    rollouts = {pose: Rollout.load(episode_path(folder, object_name, pose, seed)) for pose in range(NUM_POSES)}
+    for pose, rollout in rollouts.items():
+        if not writer.has_rollout(object_name, pose, seed):
+            writer.add_rollout(
+                object_name, pose, seed, rollout.actions, rollout.touched, rollout.visited, rollout.touched_step
+            )
+    for count in missing:
+        grids = merged_grids([rollouts[pose] for pose in RECONSTRUCTED_POSES[count]])
+        writer.add_reconstruction(object_name, count, seed, reconstructor.reconstruct(*grids))
+
+
+def _repetitions(config: EvaluationConfig) -> Iterator[tuple[str, int]]:
+    return ((name, seed) for name in config.objects for seed in config.seeds)
+
+
+def _model_metadata(model: Path) -> dict[str, Any]:
+    return json.loads((model / METADATA_FILE).read_text(encoding="utf-8"))
+
+
+def _source(config: EvaluationConfig) -> dict[str, Any]:
+    """What the episodes depend on besides object, pose and seed."""
+    model = None if config.model is None else sha256_file(config.model / MODEL_FILE)
+    return {
+        "baseline": config.baseline,
+        "model_sha256": model,
+        "deterministic": config.deterministic,
+        "asset_manifest_sha256": asset_sha256(config.objects),
+        "package_version": tslam_bench.__version__,
+        "environment": ENVIRONMENT_ID,
+    }

@@ -1,0 +1,265 @@
+"""Registered explorers: the registry, the scripted policies, and what a learned one does with a model."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
+from tslam_bench.baselines.interface import Baseline, episode_generators
+from tslam_bench.baselines.learned import METADATA_FILE, LearnedBaseline, build_policy
+from tslam_bench.baselines.random_actions import RandomBaseline
+from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
+from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH
+
+METADATA = {
+    "config": {"network": "small"},
+    "observations": {
+        "qpos": [NUM_JOINTS],
+        "qvel": [NUM_JOINTS],
+        "touch": [len(SKIN_LINKS)],
+        "occupancy": [2, GRID_SIZE, GRID_SIZE, GRID_SIZE],
+        "time": [1],
+    },
+}
+
+
+def observation(qpos: np.ndarray, generator: np.random.Generator | None = None) -> dict[str, np.ndarray]:
+    """An observation with the given joint positions; the rest is drawn, or zero without a generator."""
+    n = len(qpos)
+    draw = generator or np.random.default_rng(0)
+    filled = {
+        "qvel": draw.normal(size=(n, NUM_JOINTS)).astype(np.float32),
+        "touch": draw.integers(0, 2, (n, len(SKIN_LINKS)), dtype=np.uint8),
+        "occupancy": draw.integers(0, 2, (n, 2, GRID_SIZE, GRID_SIZE, GRID_SIZE), dtype=np.uint8),
+        "time": draw.random((n, 1), dtype=np.float32),
+    }
+    return {"qpos": qpos.astype(np.float32), **{k: v if generator else np.zeros_like(v) for k, v in filled.items()}}
+
+
+def start(n: int) -> np.ndarray:
+    qpos = np.zeros((n, NUM_JOINTS))
+    qpos[:, :4] = START_ARM_HIGH
+    return np.clip(qpos, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+
+
+@pytest.fixture(scope="module")
+def policy():
+    torch.manual_seed(3)
+    return build_policy(METADATA)
+
+
+def make(kind: str, policy) -> Baseline:
+    makers = {
+        "random": RandomBaseline,
+        "heuristic": HeuristicBaseline,
+        "learned": lambda: LearnedBaseline(policy),
+        "learned mean": lambda: LearnedBaseline(policy, deterministic=True),
+    }
+    return makers[kind]()
+
+
+def moving_hand(baseline: Baseline, seeds: list[int], steps: int, floor: float = -1.0) -> list[np.ndarray]:
+    """Actions on a hand that does what it is told, but cannot sink below ``floor``: (steps,) of (n, 28)."""
+    baseline.reset(len(seeds), seeds)
+    qpos, actions = start(len(seeds)), []
+    height = JOINT_NAMES.index("ARTy")
+    for _ in range(steps):
+        actions.append(baseline.act(observation(qpos)))
+        qpos = np.clip(qpos + actions[-1] * DELTA_STEP * 0.5, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+        qpos[:, height] = np.maximum(qpos[:, height], floor)
+    return actions
+
+
+# -- registry ---------------------------------------------------------------------------------------------------------
+def test_ten_baselines_cover_every_reward_mode_once() -> None:
+    baselines = [spec for spec in list_baselines() if spec.kind != "reference"]
+    assert len(baselines) == 10
+    learned = [spec for spec in baselines if spec.kind == "learned"]
+    assert sorted(str(spec.reward_mode) for spec in learned) == sorted(REWARD_MODES)
+    assert [spec.id for spec in learned if spec.privileged] == [f"tslam_{mode}" for mode in PRIVILEGED_REWARD_MODES]
+    assert all(spec.reward_mode is None for spec in list_baselines() if spec.kind != "learned")
+
+
+def test_unknown_id_lists_the_known_ones() -> None:
+    with pytest.raises(InvalidInputError) as caught:
+        get_baseline("randm")
+    message = str(caught.value)
+    assert "'randm'" in message and "\n" not in message
+    assert all(spec.id in message for spec in list_baselines())
+
+
+def test_make_baseline_refuses_what_has_no_policy_or_no_model(tmp_path) -> None:
+    with pytest.raises(InvalidInputError, match="no policy"):
+        make_baseline("oracle")
+    with pytest.raises(InvalidInputError, match="tslam-bench baselines train tslam_knn"):
+        make_baseline("tslam_knn")
+    with pytest.raises(InvalidInputError, match=f"{tmp_path}.*no finished model.*baselines train tslam"):
+        make_baseline("tslam", tmp_path)
+    with pytest.raises(InvalidInputError, match="takes no model"):
+        make_baseline("random", tmp_path)
+
+
+def test_damaged_model_is_one_line(tmp_path) -> None:
+    (tmp_path / METADATA_FILE).write_text(json.dumps(METADATA))
+    (tmp_path / "model.zip").write_bytes(b"not an archive")
+    with pytest.raises(InvalidInputError, match=r"cannot be read.*train it again") as caught:
+        make_baseline("tslam", tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_scripted_baselines_need_no_torch() -> None:
+    code = (
+        "import sys; from tslam_bench.baselines.registry import make_baseline, list_baselines\n"
+        "make_baseline('random'); make_baseline('heuristic'); list_baselines()\n"
+        "assert not {'torch', 'sapien', 'stable_baselines3'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+# -- every policy -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", ["random", "heuristic", "learned", "learned mean"])
+def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> None:
+    first = moving_hand(make(kind, policy), [5, 6], 40)
+    again = moving_hand(make(kind, policy), [5, 6], 40)
+    for a, b in zip(first, again, strict=True):
+        assert a.shape == (2, NUM_JOINTS) and a.dtype == np.float32
+        assert np.abs(a).max() <= 1 and np.isfinite(a).all()
+        assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", ["random", "heuristic"])
+def test_an_episode_does_not_depend_on_its_batch(kind: str, policy) -> None:
+    together = moving_hand(make(kind, policy), [11, 12, 13], 60)
+    alone = moving_hand(make(kind, policy), [12], 60)
+    assert np.array_equal(np.stack(together)[:, 1], np.stack(alone)[:, 0])
+
+
+@pytest.mark.parametrize("kind", ["random", "heuristic", "learned"])
+def test_seeds_matter(kind: str, policy) -> None:
+    one, other = (np.stack(moving_hand(make(kind, policy), [seed], 30)) for seed in (1, 2))
+    assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", ["random", "heuristic", "learned"])
+def test_wrong_batch_is_refused(kind: str, policy) -> None:
+    baseline = make(kind, policy)
+    baseline.reset(2, 0)
+    with pytest.raises(InvalidInputError, match="qpos has shape"):
+        baseline.act(observation(start(3)))
+
+
+def test_generators() -> None:
+    with pytest.raises(InvalidInputError, match="at least 1"):
+        episode_generators(0, 1)
+    with pytest.raises(InvalidInputError, match="negative"):
+        episode_generators(2, [1, -1])
+    with pytest.raises(InvalidInputError, match="one per episode"):
+        episode_generators(3, [1, 2])
+    draws = [generator.random() for generator in episode_generators(4, 9)]
+    assert len(set(draws)) == 4
+
+
+# -- random -----------------------------------------------------------------------------------------------------------
+def test_random_is_uniform_and_never_repeats() -> None:
+    baseline = RandomBaseline()
+    baseline.reset(8, 4)
+    steps = 2 * HORIZON + 50  # goes on past the horizon
+    actions = np.stack([baseline.act(observation(start(8))) for _ in range(steps)])
+    assert len(np.unique(actions[:, 0, 0])) == steps
+    # 126,000 draws: standard error 0.0016 of the mean and 0.0008 of the variance
+    assert abs(actions.mean()) < 0.008 and abs(actions.var() - 1 / 3) < 0.004
+    counts, _ = np.histogram(actions, bins=10, range=(-1, 1))
+    assert np.abs(counts / actions.size - 0.1).max() < 0.005
+
+
+# -- heuristic --------------------------------------------------------------------------------------------------------
+def phases_of(floor: float, seeds: list[int], steps: int = HORIZON) -> tuple[np.ndarray, np.ndarray]:
+    """Arm heights (steps, n) and mean finger flexion (steps, n) under the heuristic, above a floor."""
+    baseline = HeuristicBaseline()
+    baseline.reset(len(seeds), seeds)
+    qpos = start(len(seeds))
+    height = JOINT_NAMES.index("ARTy")
+    flexion = [JOINT_NAMES.index(f"{finger}J2") for finger in ("FF", "MF", "RF", "LF")]
+    heights, flexions = [], []
+    for _ in range(steps):
+        action = baseline.act(observation(qpos))
+        qpos = np.clip(qpos + action * DELTA_STEP * 0.5, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+        qpos[:, height] = np.maximum(qpos[:, height], floor)
+        heights.append(qpos[:, height].copy())
+        flexions.append(qpos[:, flexion].mean(axis=1))
+    return np.stack(heights), np.stack(flexions)
+
+
+def test_heuristic_closes_where_it_meets_an_obstacle_and_comes_back() -> None:
+    floor = 0.06
+    heights, flexions = phases_of(floor, [0, 1, 2, 3])
+    closed = flexions > 1.0
+    closing = closed[1:] & ~closed[:-1]
+    assert (heights[1:][closing] < floor + 0.01).all()  # the hand closes on the obstacle, not in the air
+    closings = closing.sum(axis=0)
+    openings = (~closed[1:] & closed[:-1]).sum(axis=0)
+    assert (closings >= 2).all() and (openings >= 1).all()  # reopened and repeated
+    assert (heights.max(axis=0) > floor + 0.03).all()
+
+
+def test_heuristic_stops_at_its_depth_when_nothing_is_there() -> None:
+    config = GraspConfig()
+    heights, flexions = phases_of(-1.0, [0, 1, 2, 3])
+    assert heights.min() > config.depth[0] - 0.01
+    assert (flexions.max(axis=0) > 1.0).all()
+
+
+def test_heuristic_visits_different_spots() -> None:
+    baseline = HeuristicBaseline()
+    baseline.reset(1, 3)
+    qpos, spots = start(1), []
+    side, flexion = JOINT_NAMES.index("ARTx"), JOINT_NAMES.index("FFJ2")
+    for _ in range(HORIZON):
+        action = baseline.act(observation(qpos))
+        qpos = np.clip(qpos + action * DELTA_STEP * 0.5, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+        if qpos[0, flexion] > 1.2:
+            spots.append(round(float(qpos[0, side]), 2))
+    assert len(set(spots)) >= 3
+
+
+# -- learned ----------------------------------------------------------------------------------------------------------
+def test_learned_samples_around_its_mean(policy) -> None:
+    qpos = np.repeat(start(1), 400, axis=0)
+    drawn, mean = LearnedBaseline(policy), LearnedBaseline(policy, deterministic=True)
+    drawn.reset(400, list(range(400)))
+    mean.reset(400, 0)
+    centre, actions = mean.act(observation(qpos)), drawn.act(observation(qpos))
+    assert np.allclose(centre, centre[:1], atol=1e-5)
+    deviation = float(np.exp(policy.log_std.detach().numpy())[0])
+    inside = np.abs(actions) < 1
+    standard = (actions - centre)[np.abs(centre) < 0.2] / deviation
+    assert abs(np.median(standard)) < 0.05  # clipping at +-1 does not move the median
+    assert 0.7 < inside.mean() < 1.0
+
+
+def test_learned_agrees_with_the_policy_it_was_made_from(policy) -> None:
+    """The short cut through the network gives what stable-baselines3's own prediction gives."""
+    generator = np.random.default_rng(8)
+    seen = observation(np.repeat(start(1), 3, axis=0) + generator.normal(size=(3, NUM_JOINTS)) * 0.1, generator)
+    baseline = LearnedBaseline(policy, deterministic=True)
+    baseline.reset(3, 0)
+    expected, _ = policy.predict(seen, deterministic=True)
+    assert np.allclose(baseline.act(seen), expected, atol=1e-5)
+
+
+def test_a_few_touched_voxels_reach_the_features(policy) -> None:
+    """Touch is sparse: the network must not lose it on its way through six convolutions."""
+    grids = torch.zeros(2, 2, GRID_SIZE, GRID_SIZE, GRID_SIZE)
+    grids[:, 1, 8:24, 8:24, 8:24] = 1
+    grids[1, 0, 10:14, 12:20, 12] = 1
+    with torch.no_grad():
+        features = policy.features_extractor.convolutions(grids)
+    assert (features[1] - features[0]).norm() > 0.02 * features[0].norm()

@@ -1,0 +1,197 @@
+"""PPO training in the real environment on two boxes: it resumes exactly, learns, and refuses bad settings."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from baseline_assets import primitive_cache
+from counting_environment import Counter
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from tslam_bench.baselines import training
+from tslam_bench.baselines.learned import MODEL_FILE, read_policy
+from tslam_bench.baselines.registry import make_baseline
+from tslam_bench.baselines.training import train
+from tslam_bench.baselines.training_config import TrainingConfig
+from tslam_bench.baselines.vector import TactileVecEnv
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.files import CACHE_VARIABLE
+
+CONFIG = TrainingConfig(
+    baseline="tslam",
+    steps=120,
+    num_envs=2,
+    rollout_steps=20,
+    batch_size=20,
+    epochs=2,
+    network="small",
+    checkpoint_every=40,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = primitive_cache(tmp_path_factory.mktemp("cache"))
+        patch.setenv(CACHE_VARIABLE, str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def straight(cache, tmp_path_factory) -> Path:
+    """A run that was never interrupted."""
+    output = tmp_path_factory.mktemp("models") / "straight"
+    train(CONFIG, output, command="the command")
+    return output
+
+
+def weights(output: Path) -> list[torch.Tensor]:
+    return list(read_policy(output).state_dict().values())
+
+
+def test_finished_run_holds_what_it_promises(straight: Path) -> None:
+    metadata = json.loads((straight / "model.json").read_text())
+    assert metadata["steps"] == 120 and metadata["baseline"] == "tslam" and metadata["reward_mode"] == "tslam"
+    assert metadata["command"] == "the command" and metadata["seconds"] > 0 and metadata["machine"]["cores"] >= 1
+    assert not (straight / "checkpoints").exists()
+    events = EventAccumulator(str(straight / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("time/fps")] == [40, 80, 120]
+    baseline = make_baseline("tslam", straight)
+    baseline.reset(1, 0)
+
+
+def test_policy_read_without_pickle_is_the_saved_one(straight: Path) -> None:
+    model = PPO.load(straight / MODEL_FILE, device="cpu")
+    for ours, theirs in zip(weights(straight), model.policy.state_dict().values(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_killed_and_resumed_run_ends_with_the_same_weights(straight: Path, tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill_at(limit: int):
+        def report(done: int) -> None:
+            if done >= limit:
+                raise Killed
+
+        return report
+
+    for limit in (10, 60, 110):  # before the first checkpoint, and twice between checkpoints
+        with pytest.raises(Killed):
+            train(CONFIG, tmp_path, on_progress=kill_at(limit))
+        assert not (tmp_path / "model.json").exists()
+        with pytest.raises(InvalidInputError, match="no finished model"):
+            make_baseline("tslam", tmp_path)
+    # A write that was cut off leaves a hidden folder, which must not be taken for a checkpoint.
+    (tmp_path / "checkpoints" / ".0000000120-cut").mkdir()
+    metadata = train(CONFIG, tmp_path)
+    assert metadata["steps"] == 120
+    for straight_weight, resumed_weight in zip(weights(straight), weights(tmp_path), strict=True):
+        assert torch.equal(straight_weight, resumed_weight)
+
+
+def test_finished_model_is_not_trained_again(straight: Path, monkeypatch) -> None:
+    monkeypatch.setattr(training, "make_training_environments", lambda config: pytest.fail("environments were made"))
+    before = (straight / MODEL_FILE).read_bytes()
+    assert train(CONFIG, straight)["steps"] == 120
+    assert (straight / MODEL_FILE).read_bytes() == before
+
+
+def test_other_settings_in_the_same_folder_are_refused(straight: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"steps 120 there, 160 here.*choose another output"):
+        train(replace(CONFIG, steps=160), straight)
+
+
+def test_every_parameter_is_trained(straight: Path, tmp_path: Path) -> None:
+    train(replace(CONFIG, steps=40), tmp_path)
+    for (name, early), late in zip(read_policy(tmp_path).state_dict().items(), weights(straight), strict=True):
+        if "joint_" not in name:  # the joint limits are constants
+            assert not torch.equal(early, late), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"baseline": "heuristic"}, "nothing to train"),
+        ({"baseline": "nope"}, "unknown"),
+        ({"split": "test"}, "train split only"),
+        ({"steps": 0}, "steps 0"),
+        ({"num_envs": -1}, "num_envs -1"),
+        ({"seed": -1}, "seed -1"),
+        ({"network": "huge"}, "network 'huge'"),
+        ({"gamma": 1.5}, "gamma"),
+    ],
+)
+def test_bad_settings_are_one_line_and_write_nothing(change, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        train(replace(CONFIG, **change), tmp_path / "model")
+    assert "\n" not in str(caught.value) and not (tmp_path / "model").exists()
+
+
+def test_output_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(AssetError, match="cannot be written"):
+        train(CONFIG, tmp_path / "file" / "model")
+
+
+def test_objects_restrict_the_draw(cache) -> None:
+    environments = training.make_training_environments(replace(CONFIG, objects=("plate",), num_envs=1))
+    try:
+        for seed in range(4):
+            environments[0].reset(seed=seed)
+            assert environments[0].unwrapped.object_name == ["plate"]
+    finally:
+        environments[0].close()
+
+
+def test_rounding_of_budgets() -> None:
+    config = replace(CONFIG, steps=81, checkpoint_every=41)
+    assert (config.iteration_steps, config.total_steps, config.chunk_steps) == (40, 120, 80)
+
+
+def test_learner_improves_where_improving_is_easy(tmp_path: Path) -> None:
+    """The whole learner on a hand-made task with the real observation space: it finds out what pays."""
+
+    class PaysForClosing(Counter):
+        """Pays the mean of the action: the best policy saturates at 1."""
+
+        def __init__(self) -> None:
+            super().__init__((20,) * 8)
+            shapes = {"qpos": (28,), "qvel": (28,), "touch": (18,), "time": (1,)}
+            entries = {key: spaces.Box(-np.inf, np.inf, shape, np.float32) for key, shape in shapes.items()}
+            entries["occupancy"] = spaces.Box(0, 1, (2, 32, 32, 32), np.uint8)
+            self.single_observation_space = self.observation_space = spaces.Dict(entries)
+            self.single_action_space = self.action_space = spaces.Box(-1, 1, (28,), np.float32)
+            self.zeros = {
+                key: torch.zeros(8, *space.shape, dtype=torch.uint8 if space.dtype == np.uint8 else torch.float32)
+                for key, space in entries.items()
+            }
+
+        def _observe(self):
+            return self.zeros
+
+        def step(self, action):
+            self.steps += 1
+            ended = self.steps >= self.lengths
+            return self._observe(), torch.as_tensor(action).mean(dim=1), torch.zeros_like(ended), ended, {}
+
+    torch.set_num_threads(1)
+    environments = VecNormalize(VecMonitor(TactileVecEnv([PaysForClosing()])), norm_obs=False)
+    config = replace(CONFIG, num_envs=8, rollout_steps=20, batch_size=40, epochs=5, learning_rate=1e-3)
+    model = training._new_model(config, environments)
+    returns = []
+    for _ in range(12):
+        model.ep_info_buffer = None
+        model.learn(160, reset_num_timesteps=False)
+        returns.append(np.mean([episode["r"] for episode in model.ep_info_buffer]))
+    assert returns[-1] > returns[0] + 2.0  # of 20 at most; the first is about 0

@@ -55,8 +55,8 @@ class DriveTargets:
             target = qpos + action * self._delta
         else:
             target = self._middle_range + action * self._half_range
-        target = self._clip_to_limits(target)
-        return self._clip_to_limits(couple(target, self._backend))
+        coupled = couple(self._clip_to_limits(target), self._backend)
+        return _pull_back(self._clip_to_limits(coupled), self._backend)
 
     def _clip_to_limits(self, target: Array) -> Array:
         xp = self._backend.module
@@ -73,3 +73,13 @@ def couple(target: Array, backend: Backend) -> Array:
     coupled[:, MIDDLE] = middle + (COUPLING_MIDDLE * scale) * excess
     coupled[:, END] = end - (COUPLING_END * scale) * excess
     return coupled
+
+
+def _pull_back(target: Array, backend: Backend) -> Array:
+    """Straightens the joint that is ahead of its tendon: mends what clipping to the limits did to the coupling, and stays inside them."""
+    xp = backend.module
+    middle, end = target[:, MIDDLE], target[:, END]
+    pulled = target.copy() if backend.is_numpy else target.clone()
+    pulled[:, END] = xp.minimum(end, (COUPLING_SLACK + COUPLING_MIDDLE * middle) * (1.0 / COUPLING_END))
+    pulled[:, MIDDLE] = xp.minimum(middle, (COUPLING_SLACK + COUPLING_END * end) * (1.0 / COUPLING_MIDDLE))
+    return pulled

@@ -111,6 +111,10 @@ class AdroitHand(BaseAgent):
     def _controller_configs(self) -> dict[str, ControllerConfig]:
         return {mode: HandControllerConfig(mode=mode) for mode in CONTROL_MODES}
 
+    def set_action(self, action: torch.Tensor) -> None:
+        """Hands the action to the controller; the task has checked it."""
+        self.controller.set_action(action)
+
     def _after_init(self) -> None:
         index = [self.robot.active_joints_map[name].active_index[0].item() for name in JOINT_NAMES]
         self.joint_order = np.array(index)
@@ -122,7 +126,7 @@ class AdroitHand(BaseAgent):
     def host_skin_matrices(self) -> np.ndarray:
         """(1, L, 3, 4) float32 poses of the skin links in the world, CPU simulation; the array is reused."""
         for row, link in enumerate(self._raw_skin_links):
-            self._skin_matrices[0, row] = link.pose.to_transformation_matrix()[:3]
+            self._skin_matrices[0, row] = link.entity_pose.to_transformation_matrix()[:3]
         return self._skin_matrices
 
     def device_skin_matrices(self) -> torch.Tensor:

@@ -1,8 +1,8 @@
 """Touch and coverage, batched over environments: probes, signed distance, contact points, voxel sets (section 5).
 
 The same code runs on numpy arrays (CPU simulation) and on torch tensors (GPU simulation, or CPU tensors in tests): it uses
-only elementwise arithmetic, gathers and order-free scatters, which both libraries compute with the same bits on a CPU
-and which do not depend on how many environments are batched.
+only elementwise arithmetic, gathers and order-free scatters, whose bits do not depend on how many environments are
+batched.
 
 Arrays are ``(environments, ...)``; E environments, P probes, N = 32 voxels per axis. World frame, metres.
 """

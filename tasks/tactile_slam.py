@@ -271,11 +271,11 @@ class TactileSLAMEnv(BaseEnv):
         return self._prepared[name]
 
     def _draw_object(self, env: int, options: dict) -> str:
-        draw = int(self._batched_episode_rng[env].randint(len(self._object_names)))  # drawn even if not used
-        return options["object"][env] if "object" in options else self._object_names[draw]
+        draw = self._batched_episode_rng[env].uniform()  # drawn even if not used: the start does not depend on the choice
+        return options["object"][env] if "object" in options else self._object_names[int(draw * len(self._object_names))]
 
     def _draw_pose(self, env: int, options: dict) -> int:
-        draw = int(self._batched_episode_rng[env].randint(NUM_POSES))
+        draw = int(self._batched_episode_rng[env].uniform() * NUM_POSES)
         if "pose" in options:
             return grids.check_pose(options["pose"][env])
         return draw if self._pose is None else self._pose
@@ -372,7 +372,8 @@ class TactileSLAMEnv(BaseEnv):
         Raises:
             InvalidInputError: the action has another shape or is not finite.
         """
-        return super().step(self._checked(action))
+        observation, reward, terminated, _, info = super().step(self._checked(action))
+        return observation, reward, terminated, self._elapsed_steps >= HORIZON, info
 
     def _checked(self, action: Any) -> torch.Tensor:
         try:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-from gymnasium.envs.registration import WrapperSpec
 
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON
+from tslam_bench.constants import ENVIRONMENT_ID
 
 ENVIRONMENT_IDS = (ENVIRONMENT_ID,)
 """Every id that the package registers."""
@@ -23,21 +22,13 @@ def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
 
 
 def register_environments() -> None:
-    """Registers every id; safe to call twice."""
+    """Registers every id; safe to call twice. The environments truncate themselves at the horizon, batched."""
     for environment_id in ENVIRONMENT_IDS:
         if environment_id in gymnasium.registry:
             continue
         gymnasium.register(
             environment_id,
             entry_point="tslam_bench.registration:make_environment",
-            max_episode_steps=HORIZON,
             disable_env_checker=True,  # ManiSkill environments return batched tensors, which the checker refuses
             kwargs={"environment_id": environment_id},
-            additional_wrappers=(
-                WrapperSpec(
-                    "MSTimeLimit",
-                    entry_point="mani_skill.utils.registration:TimeLimitWrapper",
-                    kwargs={"max_episode_steps": HORIZON},
-                ),
-            ),
         )

@@ -28,7 +28,7 @@ class IFNetConfig:
     """Size of an IF-Net. The default is the small one, for CPUs."""
 
     level_channels: tuple[tuple[int, ...], ...] = ((16,), (32,), (64,), (64,), (64,))
-    """Output channels of the 3x3x3 convolutions of each level; every level has half the resolution of the one before."""
+    """Output channels of the 3x3x3 convolutions of each level; each level halves the resolution of the one before."""
     decoder_channels: tuple[int, ...] = (128, 128)
     """Hidden layers of the point-wise decoder."""
     displacement: float = 1.0

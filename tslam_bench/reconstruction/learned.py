@@ -81,6 +81,7 @@ def save_checkpoint(
     architecture: str,
     network: torch.nn.Module,
     training: dict[str, Any],
+    threshold: float = OCCUPANCY_THRESHOLD,
     extra: dict[str, Any] | None = None,
 ) -> None:
     """Writes architecture, configuration, weights and the training record to ``path``, atomically.
@@ -90,6 +91,7 @@ def save_checkpoint(
         architecture: name in :data:`NETWORKS`.
         network: the network.
         training: what it was trained on and for how long; numbers, strings, lists and dicts only.
+        threshold: probability at which the network's output counts as solid.
         extra: further entries, such as the optimiser's state.
     """
     content = {
@@ -97,6 +99,7 @@ def save_checkpoint(
         "architecture": architecture,
         "config": _plain(dataclasses.asdict(network.config)),  # type: ignore[call-overload]
         "training": _plain(training),
+        "threshold": threshold,
         "weights": {name: tensor.detach().clone().contiguous() for name, tensor in network.state_dict().items()},
         **(extra or {}),
     }
@@ -122,8 +125,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def load_network(path: Path) -> tuple[str, torch.nn.Module, dict[str, Any]]:
-    """Architecture name, network in evaluation mode, and training record of a checkpoint.
+def load_network(path: Path) -> tuple[str, torch.nn.Module, float, dict[str, Any]]:
+    """Architecture name, network in evaluation mode, threshold and training record of a checkpoint.
 
     Raises:
         InvalidInputError: see :func:`read_checkpoint`; also weights that do not fit the configuration.
@@ -135,13 +138,19 @@ def load_network(path: Path) -> tuple[str, torch.nn.Module, dict[str, Any]]:
         network = build_network(architecture, config)
         network.load_state_dict(content["weights"])
         training = dict(content["training"])
+        threshold = float(content["threshold"])
+        if not 0 < threshold < 1:
+            raise ValueError("threshold")
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise InvalidInputError(f"{path}: weights and configuration do not fit together; {_REMEDY}") from error
-    return architecture, network.eval(), training
+    return architecture, network.eval(), threshold, training
 
 
 class LearnedReconstructor:
     """A trained network, queried over W.
+
+    The volume's 0.5 level is the network's ``threshold`` level: the difference of their logits is taken off. (Where a
+    network is unsure, the level that gives the best IoU lies below 0.5.)
 
     The network is evaluated on a 32^3 lattice first, then twice as fine wherever the coarse values in the 3^3
     neighbourhood leave the 0.5 level in reach (between 0.25 and 0.75, or on both sides); elsewhere the fine values are
@@ -152,6 +161,7 @@ class LearnedReconstructor:
         name: registered name.
         network: network with ``encode`` and ``decode``, in evaluation mode.
         training: its training record, for the reports.
+        threshold: probability at which the network's output counts as solid.
         refine: evaluate at 64^3 near the surface; False keeps the 32^3 lattice.
         batch_points: query points per pass.
         threads: torch threads.
@@ -162,6 +172,7 @@ class LearnedReconstructor:
         name: str,
         network: torch.nn.Module,
         training: dict[str, Any] | None = None,
+        threshold: float = OCCUPANCY_THRESHOLD,
         refine: bool = True,
         batch_points: int = 8192,
         threads: int = 1,
@@ -169,6 +180,7 @@ class LearnedReconstructor:
         self.name = name
         self.network = network
         self.training = training or {}
+        self.threshold = threshold
         self.refine = refine
         self.batch_points = batch_points
         self.threads = threads
@@ -196,7 +208,10 @@ class LearnedReconstructor:
         """Probabilities (M,) at points (M, 3)."""
         batches = torch.from_numpy(points.astype(np.float32)).split(self.batch_points)
         logits = [self.network.decode(features, batch[None])[0] for batch in batches]  # type: ignore[operator]
-        return torch.sigmoid(torch.cat(logits)).numpy() if logits else np.zeros(0, dtype=np.float32)
+        if not logits:
+            return np.zeros(0, dtype=np.float32)
+        offset = float(np.log(self.threshold / (1 - self.threshold)))
+        return torch.sigmoid(torch.cat(logits) - offset).numpy()
 
 
 def load_reconstructor(path: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
@@ -205,7 +220,7 @@ def load_reconstructor(path: Path, name: str | None = None, threads: int = 1) ->
     Raises:
         InvalidInputError: see :func:`load_network`; also a checkpoint of another architecture than ``name``.
     """
-    architecture, network, training = load_network(path)
+    architecture, network, threshold, training = load_network(path)
     if name is not None and architecture != name:
         raise InvalidInputError(f"{path}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor")
-    return LearnedReconstructor(architecture, network, training, threads=threads)
+    return LearnedReconstructor(architecture, network, training, threshold, threads=threads)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import ensure_writable_directory
+from tslam_bench.grids import voxel_centres
 from tslam_bench.reconstruction.learned import (
     LearnedReconstructor,
     build_network,
@@ -31,7 +32,9 @@ from tslam_bench.reconstruction.learned import (
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
 from tslam_bench.reconstruction.training_shapes import TrainingShape, place
 
-_EXAMPLE_STREAM: Final = 1  # keeps the examples' generators apart from any other use of the seed
+THRESHOLDS: Final = tuple(round(0.02 * k, 2) for k in range(5, 36))
+"""Candidate thresholds: 0.10 to 0.70."""
+_EXAMPLE_STREAM, _THRESHOLD_STREAM = 1, 2  # keep the generators of the two uses of the seed apart
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,13 @@ class TrainingConfig:
     """Seed of the initial weights and of all examples."""
     threads: int = 1
     """Torch threads; another number may change the last bits."""
+    threshold_examples: int = 48
+    """Fresh examples, after training, on which the threshold with the best mean IoU is chosen."""
     save_every: int = 50
     """Steps between the checkpoints that a killed run resumes from."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "points", "threads", "save_every"):
+        for name in ("steps", "batch_size", "points", "threads", "threshold_examples", "save_every"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: choose at least 1")
         if not 0 < self.learning_rate < 1:
@@ -113,6 +118,7 @@ def train(
     config: TrainingConfig,
     output: Path,
     log_directory: Path | None = None,
+    threshold_shapes: Sequence[TrainingShape] | None = None,
     progress: Callable[[int, float], None] | None = None,
     stop: Callable[[int], bool] | None = None,
 ) -> LearnedReconstructor | None:
@@ -127,6 +133,7 @@ def train(
         config: the training configuration.
         output: checkpoint to write.
         log_directory: TensorBoard log of the loss, optional.
+        threshold_shapes: held-out shapes to fix the threshold on; the training shapes, newly touched, if None.
         progress: called after each step with the steps done and the loss (nan for those already done on resuming).
         stop: called after each step with the steps done; returning True saves the progress and ends the run there.
 
@@ -145,6 +152,7 @@ def train(
         **dataclasses.asdict(config),
         "scale_range": list(config.scale_range),
         "objects": [shape.name for shape in shapes],
+        "threshold_objects": [shape.name for shape in threshold_shapes] if threshold_shapes else "training objects",
     }
     del record["save_every"]
     if output.exists():
@@ -168,7 +176,7 @@ def train(
     if log_directory is not None:
         from torch.utils.tensorboard import SummaryWriter
 
-        writer = SummaryWriter(str(log_directory), purge_step=start)  # type: ignore[no-untyped-call]
+        writer = SummaryWriter(str(log_directory), purge_step=start)
     network.train()
     try:
         with torch_threads(config.threads):
@@ -176,21 +184,47 @@ def train(
                 loss = _step(network, optimizer, shapes, config, step)
                 done = step + 1
                 if writer is not None:
-                    writer.add_scalar("loss/cross_entropy", loss, done)  # type: ignore[no-untyped-call]
+                    writer.add_scalar("loss/cross_entropy", loss, done)
                 if progress:
                     progress(done, loss)
                 stopped = stop is not None and done < config.steps and stop(done)
                 if stopped or (done % config.save_every == 0 and done < config.steps):
                     state = {"optimizer": optimizer.state_dict(), "steps_done": done}
-                    save_checkpoint(partial, config.architecture, network, record, state)
+                    save_checkpoint(partial, config.architecture, network, record, extra=state)
                 if stopped:
                     return None
     finally:
         if writer is not None:
-            writer.close()  # type: ignore[no-untyped-call]
-    save_checkpoint(output, config.architecture, network, record)
+            writer.close()
+    network.eval()
+    with torch_threads(config.threads):
+        threshold = best_threshold(network, threshold_shapes or shapes, config)
+    save_checkpoint(output, config.architecture, network, record, threshold)
     partial.unlink(missing_ok=True)
-    return LearnedReconstructor(config.architecture, network.eval(), record, threads=config.threads)
+    return LearnedReconstructor(config.architecture, network, record, threshold, threads=config.threads)
+
+
+def best_threshold(network: torch.nn.Module, shapes: Sequence[TrainingShape], config: TrainingConfig) -> float:
+    """The candidate of :data:`THRESHOLDS` with the best mean IoU over fresh examples of ``shapes``, unscaled.
+
+    IoU is that of the solid occupancies at the voxel centres.
+    """
+    generator = np.random.Generator(np.random.PCG64([config.seed, _THRESHOLD_STREAM]))
+    centres = voxel_centres().reshape(-1, 3)
+    points = torch.from_numpy(centres.astype(np.float32))
+    thresholds = np.array(THRESHOLDS)
+    total = np.zeros(len(thresholds))
+    for example in range(config.threshold_examples):
+        placed = place(shapes[example % len(shapes)], generator, (1.0, 1.0), config.continuous_rotation)
+        touches = simulate_touches(placed, generator)
+        grids = np.stack([touches.touched, touches.visited])[None].astype(np.float32)
+        with torch.inference_mode():
+            features = network.encode(torch.from_numpy(grids))  # type: ignore[operator]
+            logits = [network.decode(features, batch[None])[0] for batch in points.split(8192)]  # type: ignore[operator]
+        solid = torch.sigmoid(torch.cat(logits)).numpy() >= thresholds[:, None]
+        true = placed.inside(centres)
+        total += (solid & true).sum(axis=1) / np.maximum((solid | true).sum(axis=1), 1)
+    return float(thresholds[int(total.argmax())])
 
 
 def _step(network, optimizer, shapes, config: TrainingConfig, step: int) -> float:

@@ -1,0 +1,228 @@
+"""TactileSLAM-v0 on real objects: determinism, spaces, touch audit, bad input, rendering fallback."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import tslam_bench
+from tslam_bench import grids
+from tslam_bench.assets.store import load_object
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, REWARD_MODES, VOXEL_EDGE
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import COUPLING_END, COUPLING_MIDDLE, COUPLING_SLACK, JOINT_LIMITS, SKIN_LINKS
+from tslam_bench.tasks.arrays import NumpyBackend
+from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
+from tslam_bench.tasks.rendering import vulkan_device_available
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+from touch_audit import audit  # noqa: E402
+
+
+def pressing_actions(seed: int, steps: int = HORIZON) -> np.ndarray:
+    generator = np.random.Generator(np.random.PCG64(seed))
+    actions = generator.uniform(-1, 1, (steps, NUM_JOINTS)).astype(np.float32)
+    actions[:40, 1] = -1.0  # down onto the object
+    return actions
+
+
+def roll(environment: gym.Env, seed: int, options: dict | None = None, steps: int = HORIZON) -> str:
+    """SHA-256 of everything an episode returns."""
+    digest = hashlib.sha256()
+    observation, _ = environment.reset(seed=seed, options=options)
+    for action in [None, *pressing_actions(seed, steps)]:
+        if action is not None:
+            observation, reward, terminated, truncated, info = environment.step(action)
+            for value in (reward, terminated, truncated, *(info[key] for key in sorted(info))):
+                digest.update(np.asarray(value).tobytes())
+        for key in sorted(observation):
+            assert torch.isfinite(observation[key].float()).all()
+            digest.update(observation[key].numpy().tobytes())
+    return digest.hexdigest()
+
+
+@pytest.fixture(scope="module")
+def environment():
+    env = gym.make(ENVIRONMENT_ID, objects=("mug", "hammer"))
+    yield env
+    env.close()
+
+
+def test_spaces_and_horizon(environment):
+    assert environment.action_space == gym.spaces.Box(-1, 1, (NUM_JOINTS,), np.float32)
+    observation, info = environment.reset(seed=0)
+    assert set(observation) == {"qpos", "qvel", "touch", "occupancy", "time"}
+    assert environment.observation_space.contains({k: v.numpy() for k, v in observation.items()})
+    assert observation["touch"].shape == (1, len(SKIN_LINKS))
+    assert observation["occupancy"].sum() == 0 and observation["touch"].sum() == 0
+    for step in range(1, HORIZON + 1):
+        observation, _, terminated, truncated, info = environment.step(environment.action_space.sample() * 0)
+        assert not terminated.any() and bool(truncated.all()) == (step == HORIZON)
+        assert float(observation["time"]) == pytest.approx(step / HORIZON)
+    allowed = {"elapsed_steps", "new_touched", "new_visited"}
+    assert set(info) == allowed, "nothing privileged is in info"
+
+
+def test_an_episode_is_bit_identical_to_one_in_a_fresh_scene(environment):
+    options = {"object": "mug", "pose": 5}
+    first = roll(environment, 3, options)
+    roll(environment, 4, {"object": "hammer", "pose": 1})
+    assert roll(environment, 3, options) == first, "an episode before it left a trace"
+    fresh = gym.make(ENVIRONMENT_ID, object="mug", pose=5)
+    assert roll(fresh, 3, options) == first, "a new environment gives other bits"
+    fresh.close()
+    assert roll(environment, 5, options) != first, "another seed gives the same episode"
+
+
+def test_bits_are_the_same_in_another_process(environment):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import gymnasium as gym, tslam_bench\n"
+        "from test_environment import roll\n"
+        "print(roll(gym.make('tslam_bench:TactileSLAM-v0', object='mug'), 6, {'pose': 2}, 80))"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parent)]
+    other = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]
+    assert roll(environment, 6, {"object": "mug", "pose": 2}, 80) == other
+
+
+def test_touched_voxels_lie_on_the_true_surface(environment):
+    roll(environment, 1, {"object": "mug", "pose": 0})
+    base = environment.unwrapped
+    touched = grids.world_to_object(base.touched[0], 0)
+    assert touched.sum() >= 5
+    centres = grids.voxel_centres()[touched]
+    surface = load_object("mug").surface_points
+    distance = np.linalg.norm(centres[:, None] - surface[None, ::20], axis=2).min(axis=1)
+    assert np.percentile(distance, 95) < VOXEL_EDGE, "touched voxels are within a voxel of the surface"
+    np.testing.assert_array_equal(base.touched, base.touched_step > 0)
+    assert not (base.touched & ~base.visited)[0].all(), "the hand has been where it touched"
+
+
+def test_touch_agrees_with_physx_contacts():
+    result = audit("mug", episodes=2)
+    assert result.both > 200
+    assert result.precision >= 0.8 and result.recall >= 0.8
+    assert np.percentile(result.depths, 95) < 1e-3, "a pressing hand penetrates less than 1 mm at the 95th percentile"
+
+
+@pytest.mark.parametrize("reward_mode", [*REWARD_MODES, "none"])
+def test_every_reward_mode_runs_and_repeats(reward_mode):
+    env = gym.make(ENVIRONMENT_ID, object="mug", pose=0, reward_mode=reward_mode)
+    totals = []
+    for _ in range(2):
+        env.reset(seed=1)
+        rewards = [float(env.step(action)[1]) for action in pressing_actions(1, 60)]
+        totals.append(rewards)
+        assert np.isfinite(rewards).all()
+    assert totals[0] == totals[1]
+    assert (np.sum(totals[0]) > 0) == (reward_mode != "none")
+    env.close()
+
+
+def test_observation_modes_and_pickled_spec():
+    env = gym.make(ENVIRONMENT_ID, object="mug", obs_mode="state", control_mode="pd_joint_pos")
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (1, 28 + 28 + len(SKIN_LINKS) + 2 * 32**3 + 1) == env.observation_space.shape
+    env.close()
+    again = gym.make(pickle.loads(pickle.dumps(env.spec)))
+    assert again.unwrapped.control_mode == "pd_joint_pos"
+    again.close()
+
+
+def test_objects_and_poses_are_drawn_by_the_seed():
+    env = gym.make(ENVIRONMENT_ID, objects=("mug", "hammer"))
+    drawn = []
+    for _ in range(2):
+        episode = []
+        for seed in range(12):
+            env.reset(seed=seed)
+            episode.append((env.unwrapped.object_name[0], env.unwrapped.pose[0]))
+        drawn.append(episode)
+    assert drawn[0] == drawn[1]
+    assert len({name for name, _ in drawn[0]}) == 2 and len({pose for _, pose in drawn[0]}) > 3
+    env.close()
+
+
+def test_drive_targets_respect_limits_and_tendons():
+    generator = np.random.default_rng(0)
+    for mode in ("pd_joint_delta_pos", "pd_joint_pos"):
+        targets = DriveTargets(mode, NumpyBackend())
+        qpos = generator.uniform(JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1], (200, NUM_JOINTS)).astype(np.float32)
+        target = targets(generator.uniform(-2, 2, (200, NUM_JOINTS)).astype(np.float32), qpos)
+        assert (target >= JOINT_LIMITS[:, 0] - 1e-6).all() and (target <= JOINT_LIMITS[:, 1] + 1e-6).all()
+        stretch = COUPLING_END * target[:, END] - COUPLING_MIDDLE * target[:, MIDDLE]
+        assert np.abs(stretch).max() <= COUPLING_SLACK + 1e-6
+    extreme = DriveTargets("pd_joint_pos", NumpyBackend())(np.ones((1, NUM_JOINTS), np.float32), np.zeros((1, NUM_JOINTS)))
+    np.testing.assert_allclose(extreme[0, 0], JOINT_LIMITS[0, 1], rtol=1e-6)
+
+
+def test_joints_reach_their_targets():
+    env = gym.make(ENVIRONMENT_ID, object="hammer", pose=0, control_mode="pd_joint_pos")
+    env.reset(seed=0)
+    action = np.zeros(NUM_JOINTS, dtype=np.float32)
+    action[1] = 1.0  # up and away from the object
+    for _ in range(120):
+        observation, *_ = env.step(action)
+    expected = DriveTargets("pd_joint_pos", NumpyBackend())(action[None], np.zeros((1, NUM_JOINTS), np.float32))
+    np.testing.assert_allclose(observation["qpos"].numpy(), expected, atol=5e-3)
+    assert np.abs(observation["qvel"].numpy()).max() < 0.05
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"object": "mugg"}, "mugg"),
+        ({"object": "mug", "pose": 8}, "pose 8: unknown; choose an integer from 0 to 7"),
+        ({"object": "mug", "reward_mode": "dense"}, "reward_mode 'dense': unknown; choose one of tslam"),
+        ({"object": "mug", "control_mode": "pd_ee_pose"}, "control_mode 'pd_ee_pose': unknown"),
+        ({"object": "mug", "objects": ("mug",)}, "one or the other"),
+        ({"object": "mug", "num_envs": 0}, "num_envs 0"),
+    ],
+)
+def test_bad_arguments_get_one_line(arguments, message):
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        gym.make(ENVIRONMENT_ID, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_actions_get_one_line(environment):
+    environment.reset(seed=0)
+    for action, message in (
+        (np.zeros(27, np.float32), r"shape \(27,\), expected \(1, 28\)"),
+        (np.full(28, np.nan, np.float32), "not finite for joint ARTx"),
+        ("up", "not an array of numbers"),
+    ):
+        with pytest.raises(InvalidInputError, match=message) as caught:
+            environment.step(action)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InvalidInputError, match=r"options\['pose'\]: 2 values for 1 environments"):
+        environment.reset(options={"pose": [1, 2]})
+    with pytest.raises(InvalidInputError, match="pose 9"):
+        environment.reset(options={"pose": 9})
+
+
+@pytest.mark.skipif(not vulkan_device_available(), reason="no Vulkan device: rendering cannot be tested on this machine")
+def test_renders_pictures():
+    env = gym.make(ENVIRONMENT_ID, object="mug", pose=0, render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (1, 512, 512, 3) and picture.float().std() > 5
+    env.close()
+
+
+def test_import_registers_without_the_simulator():
+    code = "import sys, tslam_bench, gymnasium; assert 'TactileSLAM-v0' in gymnasium.registry\n" + (
+        "print(any(m in sys.modules for m in ('sapien', 'mani_skill', 'torch')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"
+    assert tslam_bench.__version__

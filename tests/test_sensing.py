@@ -1,0 +1,160 @@
+"""Touch and coverage against closed forms and brute force; torch against numpy; one environment against many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import binary_dilation
+from scipy.spatial.transform import Rotation
+
+from tslam_bench import grids
+from tslam_bench.assets.hand import load_hand
+from tslam_bench.assets.store import SignedDistanceField
+from tslam_bench.constants import TOUCH_DISTANCE
+from tslam_bench.hand_constants import SKIN_LINKS
+from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
+from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, TactileSensing
+from tslam_bench.tasks.skin import build_skin
+
+RADIUS, OFFSET = 0.05, np.array([0.02, -0.01, 0.015])
+
+
+def sphere_field(radius: float = RADIUS, spacing: float = 1.5e-3, centre: np.ndarray = OFFSET) -> SignedDistanceField:
+    """Exact signed distance to a sphere off the object's origin, so that a wrong turn shows."""
+    reach = radius + 0.02
+    axis = np.arange(-reach, reach + spacing, spacing)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = (np.linalg.norm(grid, axis=-1) - radius).astype(np.float32)
+    return SignedDistanceField(centre + axis[0], spacing, values, 0.0)
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return build_skin(load_hand().shapes)
+
+
+def random_links(generator: np.random.Generator, num_envs: int) -> np.ndarray:
+    """(E, L, 3, 4): links scattered around the sphere, some touching, some inside, some outside W."""
+    shape = (num_envs, len(SKIN_LINKS))
+    rotation = Rotation.random(int(np.prod(shape)), random_state=np.random.RandomState(generator.integers(1 << 30)))
+    matrices = np.zeros((*shape, 3, 4), dtype=np.float32)
+    matrices[..., :3] = rotation.as_matrix().reshape(*shape, 3, 3)
+    direction = generator.normal(size=(*shape, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    matrices[..., 3] = direction * generator.uniform(0.02, 0.16, (*shape, 1))
+    return matrices
+
+
+def make(backend, skin, poses, fields):
+    sensing = TactileSensing(len(poses), skin, backend)
+    for env, (pose, (name, field)) in enumerate(zip(poses, fields, strict=True)):
+        sensing.set_object(env, name, field, pose)
+    sensing.begin(range(len(poses)))
+    return sensing
+
+
+@pytest.mark.parametrize("pose", range(8))
+def test_touch_and_contact_points_on_a_sphere(skin, pose):
+    sensing = make(NumpyBackend(), skin, [pose], [("sphere", sphere_field())])
+    centre = grids.pose_rotation(pose) @ OFFSET
+    matrices = random_links(np.random.default_rng(pose), 1)
+    contacts = sensing.step(matrices, np.array([1]))
+    placed = np.einsum("pij,pj->pi", matrices[0, skin.probes.link][:, :, :3], skin.probes.position)
+    placed = placed + matrices[0, skin.probes.link][:, :, 3]
+    gap = np.linalg.norm(placed - centre, axis=1) - RADIUS - skin.probes.radius
+    clear = np.abs(gap - TOUCH_DISTANCE) > 0.1e-3  # the field's own error is about h^2 / (8 R) = 6 um
+    assert clear.mean() > 0.9 and contacts.on[0].sum() > 5
+    np.testing.assert_array_equal(contacts.on[0][clear], (gap <= TOUCH_DISTANCE)[clear])
+    points = contacts.points[0][contacts.mask[0]]
+    deep = np.linalg.norm(points - centre, axis=1) - RADIUS
+    assert len(points) == min(MAX_NEW_CONTACTS, int(contacts.new.sum()))
+    assert np.abs(deep).max() < 0.3e-3, "contact points lie on the surface"
+    expected = placed[contacts.on[0]]
+    expected = centre + RADIUS * (expected - centre) / np.linalg.norm(expected - centre, axis=1, keepdims=True)
+    truth, found = grids.points_to_grid(expected), sensing.touched[0]
+    assert (truth & found).sum() / (truth | found).sum() > 0.75  # points near a voxel's face may fall on either side of it
+    assert not (found & ~binary_dilation(truth, np.ones((3, 3, 3)))).any(), "and never further off than that"
+    assert int(contacts.new_touched[0]) == int(found.sum())
+    links = np.zeros(len(SKIN_LINKS), dtype=bool)
+    links[skin.probes.link[contacts.on[0]]] = True
+    np.testing.assert_array_equal(sensing.link_touch()[0], links)
+
+
+def test_grids_accumulate_like_python_sets(skin):
+    num_envs, generator = 3, np.random.default_rng(5)
+    sensing = make(NumpyBackend(), skin, [0, 3, 6], [("sphere", sphere_field())] * num_envs)
+    visited = [set() for _ in range(num_envs)]
+    on_before = np.zeros((num_envs, len(skin.probes)), dtype=bool)
+    touched_before = np.zeros(num_envs, dtype=int)
+    for step in range(1, 6):
+        matrices = random_links(generator, num_envs)
+        contacts = sensing.step(matrices, np.full(num_envs, step))
+        for env in range(num_envs):
+            chosen = matrices[env, skin.volume.link]
+            world = np.einsum("pij,pj->pi", chosen[:, :, :3], skin.volume.position) + chosen[:, :, 3]
+            cells = {tuple(v) for v in np.argwhere(grids.points_to_grid(world))}
+            assert abs(int(contacts.new_visited[env]) - len(cells - visited[env])) <= 2  # float32 at a voxel's face
+            visited[env] |= cells
+            assert abs(int(sensing.visited[env].sum()) - len(visited[env])) <= 4
+            count = int(sensing.touched[env].sum())
+            assert int(contacts.new_touched[env]) == count - touched_before[env]
+            assert int((sensing.touched_step[env] == step).sum()) == count - touched_before[env]
+            touched_before[env] = count
+        np.testing.assert_array_equal(contacts.new, contacts.on & ~on_before)
+        on_before = contacts.on
+    np.testing.assert_array_equal(sensing.touched, sensing.touched_step > 0)
+    sensing.begin([1])
+    assert sensing.touched[1].sum() == sensing.visited[1].sum() == 0 and (sensing.touched_step[1] == -1).all()
+    assert sensing.touched[0].sum() == touched_before[0], "the others keep their grids"
+
+
+def assert_same(a, b) -> None:
+    """Equal touch, counts and masks; contact points to a float32's last bit, where the libraries may round differently."""
+    for name in ("on", "new", "mask", "new_touched", "new_visited"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name).numpy(), err_msg=name)
+    np.testing.assert_allclose(a.points, b.points.numpy(), atol=3e-8)
+
+
+def test_torch_agrees_with_numpy_and_any_batch_gives_the_same_bits(skin):
+    num_envs, generator = 5, np.random.default_rng(7)
+    poses = [0, 2, 5, 7, 1]
+    fields = [("large", sphere_field(0.06, 2e-3)), ("small", sphere_field(0.03, 1.5e-3))]
+    chosen = [fields[env % 2] for env in range(num_envs)]
+    batch = make(NumpyBackend(), skin, poses, chosen)
+    tensors = make(TorchBackend("cpu"), skin, poses, chosen)
+    single = [make(NumpyBackend(), skin, [poses[env]], [chosen[env]]) for env in range(num_envs)]
+    for step in range(1, 5):
+        matrices = random_links(generator, num_envs)
+        a = batch.step(matrices, np.full(num_envs, step))
+        b = tensors.step(torch.from_numpy(matrices), torch.full((num_envs,), step))
+        assert a.on.any(axis=1).all()
+        assert_same(a, b)
+        for env in range(num_envs):
+            c = single[env].step(matrices[env : env + 1], np.array([step]))
+            for name in ("on", "new", "points", "mask", "new_touched", "new_visited"):
+                np.testing.assert_array_equal(getattr(a, name)[env], getattr(c, name)[0], err_msg=name)
+        for name in ("touched", "visited", "touched_step", "on"):
+            np.testing.assert_array_equal(getattr(batch, name), getattr(tensors, name).numpy(), err_msg=name)
+        np.testing.assert_array_equal(batch.link_touch(), tensors.link_touch().numpy())
+
+
+def test_the_device_path_covers_every_probe_and_agrees(skin):
+    """What a GPU computes (all probes, no compaction), run on the CPU."""
+    generator = np.random.default_rng(11)
+
+    class Dense(TorchBackend):
+        def select(self, mask):
+            count, width = mask.shape
+            flat = torch.arange(count * width)
+            return flat // width, flat % width
+
+    poses, chosen = [4, 1], [("sphere", sphere_field())] * 2
+    compact = make(NumpyBackend(), skin, poses, chosen)
+    dense = make(Dense("cpu"), skin, poses, chosen)
+    for step in range(1, 4):
+        matrices = random_links(generator, 2)
+        a = compact.step(matrices, np.full(2, step))
+        b = dense.step(torch.from_numpy(matrices), torch.full((2,), step))
+        assert_same(a, b)
+    np.testing.assert_array_equal(compact.touched, dense.touched.numpy())

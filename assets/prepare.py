@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+import sys
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,13 +60,13 @@ class Outcome:
 
     Attributes:
         name: the object.
-        status: ``reused`` (intact in the cache), ``prepared``, or ``failed``.
-        message: why it was rebuilt or why it failed; empty otherwise.
+        status: ``reused`` (intact in the cache), ``prepared``, ``rejected`` (by a gate) or ``failed``.
+        message: why it was rebuilt, rejected or why it failed; empty otherwise.
         record: its record, None if it failed.
     """
 
     name: str
-    status: Literal["reused", "prepared", "failed"]
+    status: Literal["reused", "prepared", "rejected", "failed"]
     message: str
     record: dict[str, Any] | None
 
@@ -76,16 +77,19 @@ def _single_threaded() -> None:
         os.environ[variable] = "1"
 
 
-def _work(source: Any, cache: Path) -> tuple[dict[str, Any] | None, str]:
-    """Prepares one object in a worker: (record, "") or (None, reason)."""
-    from tslam_bench.assets.pipeline import prepare_object
+def _work(source: Any, cache: Path) -> Outcome:
+    """Prepares one object in a worker."""
+    from tslam_bench.assets.pipeline import GateError, prepare_object
 
     try:
-        return prepare_object(source, cache), ""
+        return Outcome(source.name, "prepared", "", prepare_object(source, cache))
+    except GateError as error:
+        return Outcome(source.name, "rejected", str(error), None)
     except BenchmarkError as error:
-        return None, str(error)
+        return Outcome(source.name, "failed", str(error), None)
     except Exception as error:  # one broken mesh must not stop the others
-        return None, f"{source.split}/{source.name}: {type(error).__name__}: {error}"
+        message = f"{source.split}/{source.name}: {type(error).__name__}: {error}"
+        return Outcome(source.name, "failed", message.splitlines()[0], None)
 
 
 def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
@@ -105,13 +109,15 @@ def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
     return lines[0] if lines else None
 
 
-def prepare(items: Sequence[Any], cache: Path | None = None, workers: int = 2) -> Iterator[Outcome]:
+def prepare(items: Iterable[Any], count: int | None = None, cache: Path | None = None, workers: int = 2) -> Iterator[Outcome]:
     """Prepares objects, skipping those that are intact; yields each object's outcome as it is known.
 
-    Can be interrupted at any time: every object is written as a whole or not at all.
+    Can be interrupted at any time: every object is written as a whole or not at all. Objects that a gate rejected are
+    remembered with their parameters and not tried again.
 
     Args:
         items: sources (see :class:`tslam_bench.assets.pipeline.Source`).
+        count: stop once this many are in the cache (default: all); a rejected object is replaced by the next source.
         cache: cache directory (default: the user's).
         workers: processes.
 
@@ -119,38 +125,83 @@ def prepare(items: Sequence[Any], cache: Path | None = None, workers: int = 2) -
         AssetError: the cache cannot be written or a worker dies.
     """
     cache = ensure_writable_directory(cache or cache_directory())
-    reasons: dict[str, str] = {}
-    todo = []
-    for item in items:
-        reason = _reason_to_rebuild(item, cache)
-        if reason is None:
-            record = json.loads((store.object_directory(item.name, item.split, cache) / "record.json").read_text())
-            yield Outcome(item.name, "reused", "", record)
-        else:
-            reasons[item.name] = reason
-            todo.append(item)
-    if not todo:
-        return
-    if any(isinstance(item, ContactDBSource) for item in todo):
-        fetch(sources.CONTACTDB_WHEEL, cache)  # once, before the workers need it
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context, initializer=_single_threaded)
+    queue = iter(items)
+    wanted = count if count is not None else sys.maxsize
+    rejections = _Rejections(cache)
+    ready = 0
+    pool: ProcessPoolExecutor | None = None
+    running: dict[Future[Outcome], tuple[Any, str]] = {}
     try:
-        futures = {pool.submit(_work, item, cache): item.name for item in todo}
-        for future in as_completed(futures):
-            name = futures[future]
-            try:
-                record, message = future.result()
-            except Exception as error:  # a worker that was killed takes the pool with it
-                raise AssetError(
-                    f"{name}: a worker process ended unexpectedly ({error}); run the command again"
-                ) from error
-            if record is None:
-                yield Outcome(name, "failed", message, None)
-            else:
-                yield Outcome(name, "prepared", reasons[name], record)
+        while True:
+            while ready + len(running) < wanted and len(running) < 2 * workers:
+                item = next(queue, None)
+                if item is None:
+                    break
+                reason = _reason_to_rebuild(item, cache)
+                if reason is None:
+                    ready += 1
+                    yield Outcome(item.name, "reused", "", store.read_record(item.name, item.split, cache))
+                elif (known := rejections.get(item)) is not None:
+                    yield Outcome(item.name, "rejected", known, None)
+                else:
+                    if isinstance(item, ContactDBSource):
+                        fetch(sources.CONTACTDB_WHEEL, cache)  # here once, not in every worker
+                    pool = pool or ProcessPoolExecutor(
+                        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_single_threaded
+                    )
+                    running[pool.submit(_work, item, cache)] = (item, reason)
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                item, reason = running.pop(future)
+                try:
+                    outcome = future.result()
+                except Exception as error:  # a worker that was killed takes the pool with it
+                    raise AssetError(
+                        f"{item.name}: a worker process ended unexpectedly ({error}); run the command again"
+                    ) from error
+                if outcome.status == "prepared":
+                    ready += 1
+                    outcome = replace(outcome, message=reason)
+                elif outcome.status == "rejected":
+                    rejections.add(item, outcome.message)
+                yield outcome
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        if pool is not None:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+class _Rejections:
+    """Objects that a gate rejected, by split, kept in ``<cache>/rejected-<split>.json``."""
+
+    def __init__(self, cache: Path) -> None:
+        self._cache = cache
+
+    def _path(self, split: str) -> Path:
+        return self._cache / f"rejected-{split}.json"
+
+    def _read(self, split: str) -> dict[str, dict[str, str]]:
+        try:
+            known = json.loads(self._path(split).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return known if isinstance(known, dict) else {}
+
+    def get(self, source: Any) -> str | None:
+        """Why ``source`` was rejected with its present parameters, or None."""
+        from tslam_bench.assets.pipeline import parameters_sha256
+
+        entry = self._read(source.split).get(source.name, {})
+        return entry["reason"] if entry.get("parameters_sha256") == parameters_sha256(source) else None
+
+    def add(self, source: Any, reason: str) -> None:
+        """Remembers a rejection."""
+        from tslam_bench.assets.pipeline import parameters_sha256
+
+        entries = self._read(source.split)
+        entries[source.name] = {"parameters_sha256": parameters_sha256(source), "reason": reason}
+        write_json(self._path(source.split), entries)
 
 
 def write_manifest(split: str, path: Path | None = None, cache: Path | None = None) -> Path:

@@ -168,8 +168,13 @@ def resolve_name(name: str, split: str = "test", cache: Path | None = None) -> s
     )
 
 
-def _read_record(directory: Path, name: str, split: str) -> dict[str, Any]:
-    path = directory / "record.json"
+def read_record(name: str, split: str, cache: Path | None = None) -> dict[str, Any]:
+    """Manifest record of one prepared object (canonical name and split).
+
+    Raises:
+        AssetError: not prepared, or the record is corrupt or of another version.
+    """
+    path = object_directory(name, split, cache) / "record.json"
     if not path.exists():
         raise AssetError(f"object {name!r} of split {split} is not prepared; run: {rebuild_command(name, split)}")
     try:
@@ -215,7 +220,7 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
     split = check_split(split, cache)
     name = resolve_name(name, split, cache)
     directory = object_directory(name, split, cache)
-    record = _read_record(directory, name, split)
+    record = read_record(name, split, cache)
     arrays = {product: _read_array(directory, product, record) for product in ARRAYS}
     try:
         faces = arrays["faces"].astype(np.int64)
@@ -270,7 +275,7 @@ def list_objects(split: str = "test", cache: Path | None = None) -> list[dict[st
     """
     split = check_split(split, cache)
     return [
-        _read_record(object_directory(name, split, cache), name, split)
+        read_record(name, split, cache)
         for name in prepared_names(split, cache)
         if split != "test" or name in contactdb.OBJECTS
     ]
@@ -286,7 +291,7 @@ def asset_sha256(names: Iterable[str], split: str = "test", cache: Path | None =
     split = check_split(split, cache)
     products = {}
     for name in sorted({resolve_name(name, split, cache) for name in names}):
-        record = _read_record(object_directory(name, split, cache), name, split)
+        record = read_record(name, split, cache)
         products[name] = {product: stated["sha256"] for product, stated in record["products"].items()}
     return hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest()
 
@@ -295,8 +300,8 @@ def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Pat
     """Writes an object's products and its record, atomically.
 
     Args:
-        prepared: the object; ``record`` holds what the manifest says besides the fields that are added here (``format``,
-            ``name``, ``split``, ``category``, ``field``, ``products``).
+        prepared: the object; ``record`` holds what the manifest says besides the fields that are added here (
+            ``format``, ``name``, ``split``, ``category``, ``field``, ``products``).
         surface_faces: (100000,) the face that each surface sample lies on.
         cache: cache directory (default: the user's).
 
@@ -360,7 +365,7 @@ def damage(name: str, split: str = "test", cache: Path | None = None) -> list[st
     """
     directory = object_directory(name, split, cache)
     try:
-        record = _read_record(directory, name, split)
+        record = read_record(name, split, cache)
     except AssetError as error:
         return [str(error)]
     lines = []

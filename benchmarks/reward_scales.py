@@ -1,6 +1,6 @@
 """Episode sums of the reward terms under the random policy: where lambda and the mode scales come from (protocol section 7).
 
-    python benchmarks/reward_scales.py --episodes-per-object 8
+python benchmarks/reward_scales.py --episodes-per-object 8
 """
 
 from __future__ import annotations
@@ -54,7 +54,14 @@ def episode_sums(config: Config, mode: str) -> tuple[float, float]:
 def main(config: Config) -> None:
     """Prints one row per mode."""
     torch.set_num_threads(1)
-    table = Table("reward mode", "exploration term", "x scale", "newly visited", "x lambda", title="mean episode sums, random policy")
+    table = Table(
+        "reward mode",
+        "exploration term",
+        "x scale",
+        "newly visited",
+        "x lambda",
+        title="mean episode sums, random policy",
+    )
     for mode in tqdm(REWARD_MODES, desc="modes"):
         exploration, visited = episode_sums(config, mode)
         numbers = (exploration, exploration * MODE_SCALE[mode], visited, visited * COVERAGE_WEIGHT)

@@ -38,7 +38,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Audit:
-    """Counts of (link, step) pairs: felt by both, by the probes only, by PhysX only; and penetration depths (m) per contact step."""
+    """Counts of (link, step) pairs: felt by both, by one only; and penetration depths (m) per contact step."""
 
     both: int
     probes_only: int

@@ -53,14 +53,12 @@ def alpha_shape_triangles(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def alpha_shape_samples(points: NDArray) -> NDArray[np.float64] | None:
-    """(SAMPLES, 3) low-discrepancy samples on the alpha shape's surface; the points themselves while it is empty, None without points."""
+    """(SAMPLES, 3) low-discrepancy samples on the alpha shape; the points themselves while it is empty, None without points."""
     if len(points) == 0:
         return None
     points = thin_out(points)
     triangles = alpha_shape_triangles(points)
-    area = 0.5 * np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
+    area = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     if area.sum() <= 0:
         return points
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES * area.sum()

@@ -76,7 +76,7 @@ def couple(target: Array, backend: Backend) -> Array:
 
 
 def _pull_back(target: Array, backend: Backend) -> Array:
-    """Straightens the joint that is ahead of its tendon: mends what clipping to the limits did to the coupling, and stays inside them."""
+    """Straightens the joint that is ahead of its tendon: mends what clipping did to the coupling, inside the limits."""
     xp = backend.module
     middle, end = target[:, MIDDLE], target[:, END]
     pulled = target.copy() if backend.is_numpy else target.clone()

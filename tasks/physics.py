@@ -63,7 +63,9 @@ def object_entity(prepared: PreparedObject, name: str, shapes: Sequence[Any], ca
     entity = sapien.Entity()
     entity.name = name
     body = physx.PhysxRigidDynamicComponent()
-    body.kinematic = True  # fixed in the world; kinematic rather than static so that a GPU scene can turn it between episodes
+    body.kinematic = (
+        True  # fixed in the world; kinematic rather than static so that a GPU scene can turn it between episodes
+    )
     for shape in shapes:
         body.attach(shape)
     if len(body.collision_shapes) != len(prepared.hulls):

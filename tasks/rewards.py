@@ -252,4 +252,4 @@ class AlphaShapes:
                 reward[env] = chamfer_l2(before, after) / WORKSPACE_EDGE**2
             if after is not None:
                 self._samples[env] = after
-        return backend.array(reward)  # type: ignore[attr-defined]
+        return backend.array(reward)

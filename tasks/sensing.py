@@ -223,9 +223,7 @@ class TactileSensing:
         on[rows, columns] = felt & near[rows, columns]
         return on, u
 
-    def _touch_voxels(
-        self, on: Array, new: Array, u: list[Array], step: Array
-    ) -> tuple[Array, Array, Array]:
+    def _touch_voxels(self, on: Array, new: Array, u: list[Array], step: Array) -> tuple[Array, Array, Array]:
         backend, xp = self.backend, self._xp
         rows, columns = backend.select(on)
         flags = on[rows, columns]
@@ -270,7 +268,9 @@ class TactileSensing:
         return points[:, :MAX_NEW_CONTACTS], mask[:, :MAX_NEW_CONTACTS]
 
     def _visit_voxels(self, components: Array) -> Array:
-        placed = self._volume.place(components.transpose(2, 0, 1) if self.backend.is_numpy else components.permute(2, 0, 1))
+        placed = self._volume.place(
+            components.transpose(2, 0, 1) if self.backend.is_numpy else components.permute(2, 0, 1)
+        )
         key = self._voxel_key(placed, self._env_base)
         fresh = self._first_of_each(self._visited, key)
         self.backend.put(self._visited, key, True)
@@ -325,7 +325,8 @@ class _BoundPoints:
         parts = self._backend.take_last(components, self._link)
         x, y, z = self._local
         return [
-            parts[4 * row] * x + parts[4 * row + 1] * y + parts[4 * row + 2] * z + parts[4 * row + 3] for row in range(3)
+            parts[4 * row] * x + parts[4 * row + 1] * y + parts[4 * row + 2] * z + parts[4 * row + 3]
+            for row in range(3)
         ]
 
 

@@ -134,9 +134,9 @@ def _volume_points(shape: CollisionShape) -> tuple[NDArray[np.float64], float]:
         np.stack([radius * np.cos(angle + turn), radius * np.sin(angle + turn), np.full(around, z)], axis=1)
         for z, turn in zip(stations, np.arange(len(stations)) * np.pi / around, strict=True)
     ]
-    caps = []
+    caps: list[NDArray[np.float64]] = []
     for end in (-1.0, 1.0):
-        caps.append([[0.0, 0.0, end * (half + radius)]])
+        caps.append(np.array([[0.0, 0.0, end * (half + radius)]]))
         tilt = np.pi / 4
         on_cap = max(4, int(np.ceil(2 * np.pi * radius * np.cos(tilt) / VOLUME_SPACING)))
         turn = 2 * np.pi * np.arange(on_cap) / on_cap

@@ -55,7 +55,6 @@ _HEIGHT = JOINT_NAMES.index("ARTy")
 _OPEN_QPOS = np.clip(0.0, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
 
 
-
 class TactileSLAMEnv(BaseEnv):
     """A blind 28-DoF hand with binary touch explores a fixed, unknown object for 200 steps (6 s).
 
@@ -98,7 +97,7 @@ class TactileSLAMEnv(BaseEnv):
     **Version history.** v0: first version, protocol 1.
     """
 
-    SUPPORTED_ROBOTS = ["adroit28"]
+    SUPPORTED_ROBOTS = ("adroit28",)
     SUPPORTED_OBS_MODES = ("state_dict", "state", "none", "sensor_data", "any_textures", "pointcloud")
     SUPPORTED_REWARD_MODES = (*REWARD_MODES, "none")
     agent: AdroitHand
@@ -136,7 +135,9 @@ class TactileSLAMEnv(BaseEnv):
         if names is None:
             names = [record["name"] for record in list_objects(split)]
         if not names:
-            raise InvalidInputError(f"split {split!r}: no prepared objects; run 'tslam-bench assets prepare --split {split}'")
+            raise InvalidInputError(
+                f"split {split!r}: no prepared objects; run 'tslam-bench assets prepare --split {split}'"
+            )
         self._object_names = tuple(self._load(name).name for name in names) if len(names) == 1 else tuple(names)
         self.object_name: list[str] = [""] * num_envs
         self.pose: list[int] = [0] * num_envs
@@ -214,7 +215,7 @@ class TactileSLAMEnv(BaseEnv):
         self.scene.px.timestep = self.sim_timestep
         self._bodies = {}
 
-    def _load_agent(self, options: dict) -> None:  # type: ignore[override]
+    def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, AdroitHand.base_pose())
 
     def _load_scene(self, options: dict) -> None:
@@ -271,8 +272,12 @@ class TactileSLAMEnv(BaseEnv):
         return self._prepared[name]
 
     def _draw_object(self, env: int, options: dict) -> str:
-        draw = self._batched_episode_rng[env].uniform()  # drawn even if not used: the start does not depend on the choice
-        return options["object"][env] if "object" in options else self._object_names[int(draw * len(self._object_names))]
+        draw = self._batched_episode_rng[
+            env
+        ].uniform()  # drawn even if not used: the start does not depend on the choice
+        return (
+            options["object"][env] if "object" in options else self._object_names[int(draw * len(self._object_names))]
+        )
 
     def _draw_pose(self, env: int, options: dict) -> int:
         draw = int(self._batched_episode_rng[env].uniform() * NUM_POSES)
@@ -316,7 +321,9 @@ class TactileSLAMEnv(BaseEnv):
         self._contacts = None
         self._reward = None
         if not self.gpu_sim_enabled and bool(self._sensing.touches(self.agent.host_skin_matrices()).any()):
-            raise AssetError(f"{self.object_name[0]}: touches the hand at the start, so it does not fit in the workspace")
+            raise AssetError(
+                f"{self.object_name[0]}: touches the hand at the start, so it does not fit in the workspace"
+            )
 
     def _place_gpu_objects(self, env_idx: torch.Tensor, qpos: np.ndarray) -> None:
         """Turns the objects and places the hands of ``env_idx``. Not run on a GPU yet."""
@@ -413,7 +420,9 @@ class TactileSLAMEnv(BaseEnv):
         info = {"elapsed_steps": self._elapsed_steps.clone()}
         for key in ("new_touched", "new_visited"):
             count = None if self._contacts is None else getattr(self._contacts, key)
-            info[key] = torch.zeros_like(self._elapsed_steps, dtype=torch.int64) if count is None else self._tensor(count)
+            info[key] = (
+                torch.zeros_like(self._elapsed_steps, dtype=torch.int64) if count is None else self._tensor(count)
+            )
         return info
 
     def _tensor(self, value: Any) -> torch.Tensor:

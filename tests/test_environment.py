@@ -24,7 +24,7 @@ from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
 from tslam_bench.tasks.rendering import vulkan_device_available
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-from touch_audit import audit  # noqa: E402
+from touch_audit import audit
 
 
 def pressing_actions(seed: int, steps: int = HORIZON) -> np.ndarray:
@@ -161,7 +161,9 @@ def test_drive_targets_respect_limits_and_tendons():
         assert (target >= JOINT_LIMITS[:, 0] - 1e-6).all() and (target <= JOINT_LIMITS[:, 1] + 1e-6).all()
         stretch = COUPLING_END * target[:, END] - COUPLING_MIDDLE * target[:, MIDDLE]
         assert np.abs(stretch).max() <= COUPLING_SLACK + 1e-6
-    extreme = DriveTargets("pd_joint_pos", NumpyBackend())(np.ones((1, NUM_JOINTS), np.float32), np.zeros((1, NUM_JOINTS)))
+    extreme = DriveTargets("pd_joint_pos", NumpyBackend())(
+        np.ones((1, NUM_JOINTS), np.float32), np.zeros((1, NUM_JOINTS))
+    )
     np.testing.assert_allclose(extreme[0, 0], JOINT_LIMITS[0, 1], rtol=1e-6)
 
 
@@ -211,7 +213,9 @@ def test_bad_actions_get_one_line(environment):
         environment.reset(options={"pose": 9})
 
 
-@pytest.mark.skipif(not vulkan_device_available(), reason="no Vulkan device: rendering cannot be tested on this machine")
+@pytest.mark.skipif(
+    not vulkan_device_available(), reason="no Vulkan device: rendering cannot be tested on this machine"
+)
 def test_renders_pictures():
     env = gym.make(ENVIRONMENT_ID, object="mug", pose=0, render_mode="rgb_array")
     env.reset(seed=0)
@@ -224,5 +228,8 @@ def test_import_registers_without_the_simulator():
     code = "import sys, tslam_bench, gymnasium; assert 'TactileSLAM-v0' in gymnasium.registry\n" + (
         "print(any(m in sys.modules for m in ('sapien', 'mani_skill', 'torch')))"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+        == "False"
+    )
     assert tslam_bench.__version__

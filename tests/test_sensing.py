@@ -73,7 +73,9 @@ def test_touch_and_contact_points_on_a_sphere(skin, pose):
     expected = placed[contacts.on[0]]
     expected = centre + RADIUS * (expected - centre) / np.linalg.norm(expected - centre, axis=1, keepdims=True)
     truth, found = grids.points_to_grid(expected), sensing.touched[0]
-    assert (truth & found).sum() / (truth | found).sum() > 0.75  # points near a voxel's face may fall on either side of it
+    assert (truth & found).sum() / (
+        truth | found
+    ).sum() > 0.75  # points near a voxel's face may fall on either side of it
     assert not (found & ~binary_dilation(truth, np.ones((3, 3, 3)))).any(), "and never further off than that"
     assert int(contacts.new_touched[0]) == int(found.sum())
     links = np.zeros(len(SKIN_LINKS), dtype=bool)

@@ -23,11 +23,11 @@ def hull_points(touched: NDArray[np.bool_]) -> NDArray[np.float64]:
     plane) are replaced by the corners of their voxels, which thickens the flat hull to one voxel; a single touched
     voxel then gives exactly that voxel.
     """
-    centres = np.argwhere(touched) + 0.5
+    centres = np.argwhere(touched).astype(np.float64) + 0.5
     # Exact: the differences are small integers, far from the tolerance of the rank.
     if len(centres) > 0 and np.linalg.matrix_rank(centres - centres[0]) < 3:
         centres = np.unique((centres[:, None] + _CORNERS).reshape(-1, 3), axis=0)
-    return WORKSPACE_LOW + VOXEL_EDGE * centres
+    return np.asarray(WORKSPACE_LOW + VOXEL_EDGE * centres, dtype=np.float64)
 
 
 def hull_planes(touched: NDArray[np.bool_]) -> NDArray[np.float64]:

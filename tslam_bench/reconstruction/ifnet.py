@@ -56,6 +56,7 @@ class IFNet(nn.Module):
         if not levels or not all(levels) or GRID_SIZE % 2 ** (len(levels) - 1):
             raise InvalidInputError(f"level_channels {levels}: give one to six levels of one convolution or more each")
         self.config = config
+        self.neighbours: torch.Tensor
         self.levels = nn.ModuleList()
         channels, sampled = INPUT_CHANNELS, INPUT_CHANNELS
         for level, widths in enumerate(levels):

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -30,51 +30,12 @@ from tslam_bench.reconstruction.learned import (
     torch_threads,
 )
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
+from tslam_bench.reconstruction.training_config import TrainingConfig
 from tslam_bench.reconstruction.training_shapes import TrainingShape, place
 
 THRESHOLDS: Final = tuple(round(0.02 * k, 2) for k in range(5, 36))
 """Candidate thresholds: 0.10 to 0.70."""
 _EXAMPLE_STREAM, _THRESHOLD_STREAM = 1, 2  # keep the generators of the two uses of the seed apart
-
-
-@dataclass(frozen=True)
-class TrainingConfig:
-    """How a reconstructor is trained."""
-
-    architecture: Literal["ifnet", "convonet"] = "ifnet"
-    """Network: ifnet (the paper's) or convonet."""
-    size: Literal["small", "paper"] = "small"
-    """Size of the network; paper is for ifnet on a large machine."""
-    steps: int = 300
-    """Optimiser steps: the whole budget. The learning rate falls to zero at the last one."""
-    batch_size: int = 8
-    """Examples per step, each a shape in a new pose with new touches."""
-    points: int = 512
-    """Labelled query points per example."""
-    learning_rate: float = 2e-3
-    """Adam's learning rate at its peak; it rises over the first 5 % of the steps and falls as a half cosine."""
-    scale_range: tuple[float, float] = (0.8, 1.2)
-    """Every example scales its shape by a factor from this range."""
-    continuous_rotation: bool = False
-    """Turn shapes by any rotation instead of one of the 24 that map axes to axes."""
-    seed: int = 0
-    """Seed of the initial weights and of all examples."""
-    threads: int = 1
-    """Torch threads; another number may change the last bits."""
-    threshold_examples: int = 48
-    """Fresh examples, after training, on which the threshold with the best mean IoU is chosen."""
-    save_every: int = 50
-    """Steps between the checkpoints that a killed run resumes from."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "points", "threads", "threshold_examples", "save_every"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} {getattr(self, name)}: choose at least 1")
-        if not 0 < self.learning_rate < 1:
-            raise InvalidInputError(f"learning_rate {self.learning_rate}: choose a number between 0 and 1")
-        low, high = self.scale_range
-        if not 0 < low <= high:
-            raise InvalidInputError(f"scale_range {self.scale_range}: choose two positive numbers, the smaller first")
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,7 @@ class TrainingShape:
     def inside(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether ``points`` (..., 3) in the shape's frame are in the solid, to the nearest sample of the lookup."""
         index = np.rint((points + self.half_extents) / LOOKUP_SPACING).astype(np.int64)
-        within = ((index >= 0) & (index < self.lookup.shape)).all(axis=-1)
+        within = np.asarray(((index >= 0) & (index < self.lookup.shape)).all(axis=-1))
         index = np.where(within[..., None], index, 0)
         return within & self.lookup[index[..., 0], index[..., 1], index[..., 2]]
 

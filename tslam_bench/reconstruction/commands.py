@@ -1,0 +1,185 @@
+"""``tslam-bench reconstruct``: list, train and run reconstructors."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from tslam_bench.constants import OCCUPANCY_THRESHOLD, WORKSPACE_EDGE
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.files import atomic_file
+from tslam_bench.grids import merge, world_to_object
+from tslam_bench.reconstruction.inputs import read_grids
+from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
+from tslam_bench.reconstruction.training_config import TrainingConfig
+
+_USAGE = """usage: tslam-bench reconstruct COMMAND ...
+
+From touched and visited grids to a shape.
+
+commands:
+  list   name the reconstructors
+  train  train a learned one on simulated touches
+  run    reconstruct from grids in a file
+
+tslam-bench reconstruct COMMAND --help tells more."""
+
+
+@dataclass(frozen=True)
+class ListArguments:
+    """Names the reconstructors."""
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+@dataclass(frozen=True)
+class TrainArguments:
+    """Trains a learned reconstructor on simulated touches of prepared objects.
+
+    A run that was stopped goes on where it was saved last; a finished one is left alone.
+    """
+
+    config: tyro.conf.OmitArgPrefixes[TrainingConfig]
+    output: Path
+    """Checkpoint to write."""
+    split: str = "train"
+    """Split to learn from."""
+    count: int | None = None
+    """Learn from this many of its prepared objects, the first by name; all of them if not given."""
+    threshold_split: str = "val"
+    """Split whose prepared objects fix the threshold; if none is prepared, the training objects do."""
+    log: Path | None = None
+    """Directory of a TensorBoard log."""
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Reconstructs a shape from touched and visited grids, and writes it as a mesh or a probability grid."""
+
+    touched: tuple[Path, ...]
+    """One or more .npz files with the arrays touched and, optionally, visited; they are merged."""
+    output: Path
+    """File to write: .ply, .stl, .obj or .off for a mesh in metres, .npz for the probabilities."""
+    reconstructor: str = "hull"
+    """Which one (tslam-bench reconstruct list)."""
+    model: Path | None = None
+    """Checkpoint, for those that need one."""
+    poses: tuple[int, ...] = ()
+    """Pose of each file, if its grids are in the world frame (rollouts are); none: they are in the object frame."""
+    split: str = "train"
+    """Split that mean_shape and retrieval are built from."""
+    threads: int = 1
+    """Torch threads."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Runs ``tslam-bench reconstruct`` with the given arguments.
+
+    Raises:
+        BenchmarkError: bad input; the message is one line.
+    """
+    commands = {"list": _list, "train": _train, "run": _run}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_USAGE)
+        sys.exit(0 if arguments else 2)
+    if arguments[0] not in commands:
+        raise InvalidInputError(f"reconstruct {arguments[0]!r}: unknown command; choose one of {', '.join(commands)}")
+    commands[arguments[0]](list(arguments[1:]))
+
+
+def _list(arguments: list[str]) -> None:
+    parsed = tyro.cli(ListArguments, args=arguments, prog="tslam-bench reconstruct list")
+    registered = list_reconstructors()
+    if parsed.json:
+        print(json.dumps([dataclasses.asdict(info) for info in registered], indent=2))
+        return
+    rows = [("id", "needs", "nothing touched", "summary")]
+    rows += [(info.id, info.needs, info.empty, info.summary) for info in registered]
+    widths = [max(len(row[i]) for row in rows) for i in range(3)]
+    for row in rows:
+        print("  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]]))
+
+
+def _train(arguments: list[str]) -> None:
+    from tqdm import tqdm
+
+    from tslam_bench.reconstruction.training import train
+    from tslam_bench.reconstruction.training_objects import load_training_shapes, training_names
+
+    parsed = tyro.cli(TrainArguments, args=arguments, prog="tslam-bench reconstruct train")
+    config = parsed.config
+    names = training_names(parsed.split, parsed.count)
+    try:
+        held_out = training_names(parsed.threshold_split)
+    except AssetError:
+        held_out = []
+    with tqdm(total=len(names) + len(held_out), unit="object", desc="sample objects", mininterval=1.0) as bar:
+        shapes = load_training_shapes(parsed.split, parsed.count, config.seed, progress=lambda done, _: bar.update())
+        threshold_shapes = None
+        if held_out:
+            threshold_shapes = load_training_shapes(
+                parsed.threshold_split, None, config.seed, progress=lambda done, _: bar.update()
+            )
+
+    with tqdm(total=config.steps, unit="step", desc=f"train {config.architecture}", mininterval=1.0) as bar:
+
+        def show(done: int, loss: float) -> None:
+            bar.update(done - bar.n)
+            if not math.isnan(loss):
+                bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
+
+        reconstructor = train(shapes, config, parsed.output, parsed.log, threshold_shapes, show)
+        bar.update(config.steps - bar.n)
+    assert reconstructor is not None  # only `stop` ends a run early
+    print(
+        f"{parsed.output}: {config.architecture}, {config.steps} steps on {len(shapes)} objects, "
+        f"threshold {reconstructor.threshold:.2f}"
+    )
+
+
+def _run(arguments: list[str]) -> None:
+    parsed = tyro.cli(RunArguments, args=arguments, prog="tslam-bench reconstruct run")
+    suffix = parsed.output.suffix.lower()
+    if suffix not in (".ply", ".stl", ".obj", ".off", ".npz"):
+        raise InvalidInputError(
+            f"--output {parsed.output}: unknown kind of file; end it in .ply, .stl, .obj, .off or .npz"
+        )
+    if parsed.poses and len(parsed.poses) != len(parsed.touched):
+        raise InvalidInputError(
+            f"--poses: {len(parsed.poses)} poses for {len(parsed.touched)} files; give one for each"
+        )
+    pairs = [read_grids(path) for path in parsed.touched]
+    if parsed.poses:
+        pairs = [
+            (world_to_object(touched, pose), world_to_object(visited, pose))
+            for (touched, visited), pose in zip(pairs, parsed.poses, strict=True)
+        ]
+    touched, visited = (merge(pair[channel] for pair in pairs) for channel in (0, 1))
+    reconstructor = make_reconstructor(parsed.reconstructor, parsed.model, parsed.split, threads=parsed.threads)
+    volume = reconstructor.reconstruct(touched, visited)
+    mesh = volume.to_mesh()
+    if suffix != ".npz" and len(mesh.faces) == 0:
+        raise InvalidInputError(
+            f"{parsed.reconstructor}: the reconstruction is empty ({int(touched.sum())} voxels touched), "
+            "and a mesh file cannot hold that; write .npz instead"
+        )
+    with atomic_file(parsed.output) as temporary:
+        if suffix == ".npz":
+            with temporary.open("wb") as stream:
+                np.savez_compressed(stream, probability=volume.probability, interpolation=volume.interpolation)
+        else:
+            mesh.export(str(temporary), file_type=suffix[1:])
+    solid = float((volume.probability >= OCCUPANCY_THRESHOLD).mean()) * WORKSPACE_EDGE**3 * 1e6
+    print(
+        f"{parsed.output}: {parsed.reconstructor} from {int(touched.sum())} touched and {int(visited.sum())} visited "
+        f"voxels, about {solid:.0f} cm3"
+    )

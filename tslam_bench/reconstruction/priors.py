@@ -1,0 +1,126 @@
+"""What the training shapes alone tell: ``mean_shape``, which ignores touch, and ``retrieval``, which picks one of them.
+
+They bound from below what completing a shape by learning should bring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from tslam_bench.assets.store import PreparedObject
+from tslam_bench.constants import OCCUPANCY_THRESHOLD
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.reconstruction.inputs import GRID_SHAPE, check_grids, empty_volume
+from tslam_bench.reconstruction.training_shapes import axis_rotations
+from tslam_bench.reconstruction.volume import Volume
+
+FAR_VOXELS: Final = 3.0
+"""A touched voxel at least this far (voxel edges) from a shape's surface speaks against it with full weight."""
+
+
+def _solids(objects: Sequence[PreparedObject]) -> NDArray[np.bool_]:
+    if not objects:
+        raise InvalidInputError("training objects: none; prepare some with `tslam-bench assets prepare --split train`")
+    return np.stack([item.solid for item in objects])
+
+
+class MeanShapeReconstructor:
+    """The mean of the training solids, whatever was touched; also when nothing was.
+
+    A voxel's occupancy is its share of solid training shapes in their canonical orientation. The share at which the
+    volume has the best mean IoU with the training solids is mapped to 0.5 (piecewise linear), since few voxels are solid
+    in half of all shapes.
+
+    Args:
+        objects: training objects.
+
+    Raises:
+        InvalidInputError: there are none.
+    """
+
+    name = "mean_shape"
+
+    def __init__(self, objects: Sequence[PreparedObject]) -> None:
+        solids = _solids(objects)
+        share = solids.mean(axis=0)
+        levels = np.unique(share[share > 0])
+        if len(levels) == 0:
+            self._volume = empty_volume()
+            return
+        scores = []
+        for level in levels:
+            solid = share >= level
+            scores.append(np.mean((solids & solid).sum(axis=(1, 2, 3)) / (solids | solid).sum(axis=(1, 2, 3))))
+        self.level = float(levels[int(np.argmax(scores))])
+        probability = np.interp(share, [0.0, self.level, max(1.0, self.level + 1e-9)], [0.0, OCCUPANCY_THRESHOLD, 1.0])
+        self._volume = Volume(probability, "linear")
+
+    def reconstruct(self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]) -> Volume:
+        """Touched and visited grids (32, 32, 32) bool, object frame -> the same 32^3 volume every time."""
+        check_grids(touched, visited)
+        return self._volume
+
+
+class RetrievalReconstructor:
+    """The training shape, in one of the 24 rotations that map axes to axes, that agrees best with touch and free space.
+
+    The disagreement is the mean over touched voxels of their distance to the shape's surface voxels, in units of
+    :data:`FAR_VOXELS` and at most 1, plus the share of free voxels (visited, not touched) in the shape's solid, relative
+    to the solid's size. Nothing touched: empty, since nothing was felt that could be looked up.
+
+    Args:
+        objects: training objects.
+
+    Raises:
+        InvalidInputError: there are none.
+    """
+
+    name = "retrieval"
+
+    def __init__(self, objects: Sequence[PreparedObject]) -> None:
+        self._solids = _solids(objects)
+        self.objects = [item.name for item in objects]
+        distances = [distance_transform_edt(~item.surface) for item in objects]
+        self._surface_cost = (np.minimum(np.stack(distances), FAR_VOXELS) / FAR_VOXELS).astype(np.float32)
+        sizes = np.maximum(self._solids.sum(axis=(1, 2, 3)), 1)
+        self._solid_cost = (self._solids / sizes[:, None, None, None]).astype(np.float32)
+
+    def best_match(
+        self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]
+    ) -> tuple[int, NDArray[np.int64], float]:
+        """Index of the best training object, its rotation (3, 3) into the object frame, and its disagreement.
+
+        Equal disagreements go to the earlier object, then to the earlier rotation.
+        """
+        rotations = axis_rotations()
+        free = visited & ~touched
+        # The input is turned back into each shape's frame, which is cheaper than turning every shape.
+        touched_turned = np.stack([turn_grid(touched, rotation.T).reshape(-1) for rotation in rotations])
+        free_turned = np.stack([turn_grid(free, rotation.T).reshape(-1) for rotation in rotations])
+        count = len(self._solids)
+        cost = self._surface_cost.reshape(count, -1) @ touched_turned.T.astype(np.float32) / touched.sum()
+        cost += self._solid_cost.reshape(count, -1) @ free_turned.T.astype(np.float32)
+        shape, rotation = np.unravel_index(int(cost.argmin()), cost.shape)
+        return int(shape), rotations[rotation], float(cost[shape, rotation])
+
+    def reconstruct(self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]) -> Volume:
+        """Touched and visited grids (32, 32, 32) bool, object frame -> 32^3 volume with linear interpolation."""
+        touched, visited = check_grids(touched, visited)
+        if not touched.any():
+            return empty_volume()
+        shape, rotation, _ = self.best_match(touched, visited)
+        return Volume(turn_grid(self._solids[shape], rotation).astype(np.float32), "linear")
+
+
+def turn_grid(grid: NDArray, rotation: NDArray[np.int64]) -> NDArray:
+    """Moves each voxel of ``grid`` (32, 32, 32) to where ``rotation``, a signed permutation, takes its centre."""
+    if grid.shape != GRID_SHAPE:
+        raise InvalidInputError(f"grid: shape {grid.shape}; expected {GRID_SHAPE}")
+    source_axis = np.abs(rotation).argmax(axis=1)
+    turned = grid.transpose(tuple(source_axis))
+    return np.flip(turned, axis=tuple(a for a in range(3) if rotation[a, source_axis[a]] < 0))

@@ -56,6 +56,10 @@ class Backend(ABC):
         """``value[..., index]``."""
 
     @abstractmethod
+    def link_components(self, link_matrices: Array) -> Array:
+        """(E, L, 3, 4) -> (12, E, L), contiguous."""
+
+    @abstractmethod
     def put(self, flat: Array, index: Array, value: Any) -> None:
         """``flat[index] = value``; which of several values for one element stays is not defined."""
 
@@ -109,6 +113,10 @@ class NumpyBackend(Backend):
     @override
     def take_last(self, value: np.ndarray, index: np.ndarray) -> np.ndarray:
         return value.take(index, axis=-1)
+
+    @override
+    def link_components(self, link_matrices: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(link_matrices.reshape(*link_matrices.shape[:2], 12).transpose(2, 0, 1))
 
     @override
     def put(self, flat: np.ndarray, index: np.ndarray, value: Any) -> None:
@@ -172,6 +180,10 @@ class TorchBackend(Backend):
     @override
     def take_last(self, value: Array, index: Array) -> Array:
         return value[..., index]
+
+    @override
+    def link_components(self, link_matrices: Array) -> Array:
+        return link_matrices.reshape(*link_matrices.shape[:2], 12).permute(2, 0, 1).contiguous()
 
     @override
     def put(self, flat: Array, index: Array, value: Any) -> None:

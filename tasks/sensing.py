@@ -170,11 +170,10 @@ class TactileSensing:
         self._stride = [array(np.array([s[a] for s in strides], dtype=np.int64)[:, None]) for a in range(3)]
         self._last_cell = [array(np.array([s[a] - 2 for s in sizes], dtype=np.float32)[:, None]) for a in range(3)]
         self._origin = [array(np.array([o[a] for o in origins], dtype=np.float32)[:, None]) for a in range(3)]
-        self._spacing = array(np.array(spacings, dtype=np.float32)[:, None])
         self._inverse_spacing = array((1.0 / np.array(spacings)).astype(np.float32)[:, None])
         # A sample is at most half a cell diagonal away from a point, and distance is 1-Lipschitz.
         self._cull_margin = array((np.sqrt(3.0) / 2 * 1.001 * np.array(spacings)).astype(np.float32)[:, None])
-        self._turn = [[array(self._turn_host[:, a, b, None].copy()) for b in range(3)] for a in range(3)]
+        self._turn = array(self._turn_host)
         self._bound = True
 
     # -- one step ---------------------------------------------------------------------------------------------
@@ -188,17 +187,16 @@ class TactileSensing:
         Returns:
             The step's contacts.
         """
-        components = link_matrices.reshape(self.num_envs, self._num_links, 12)
-        on, probe_cells = self._touch(components)
+        on, felt = self._touch(link_matrices)
         new = on & ~self._on
         self._on = on
-        new_touched, points, mask = self._touch_voxels(on, new, probe_cells, step)
-        new_visited = self._visit_voxels(components)
+        new_touched, points, mask = self._touch_voxels(felt, new, step)
+        new_visited = self._visit_voxels(link_matrices)
         return Contacts(on, new, points, mask, new_touched, new_visited)
 
     def touches(self, link_matrices: Array) -> Array:
         """(E, P) bool, probes that would be on for these link poses; changes nothing."""
-        return self._touch(link_matrices.reshape(self.num_envs, self._num_links, 12))[0]
+        return self._touch(link_matrices)[0]
 
     def link_touch(self) -> Array:
         """(E, L) bool: a link's touch bit is on when any of its probes is."""
@@ -206,50 +204,42 @@ class TactileSensing:
             return np.logical_or.reduceat(self._on, self._first_probe, axis=1)
         return (self._on.to(self._link_of_probe.dtype) @ self._link_of_probe) > 0  # 0/1 sums: exact
 
-    def _touch(self, components: Array) -> tuple[Array, list[Array]]:
-        """(E, P) probes on, and three (E, P) arrays of probe positions in field cells, for the contact points."""
-        xp = self._xp
-        local = self._to_object_frame(components)
-        u = [(p - o) * self._inverse_spacing for p, o in zip(self._probes.place(local), self._origin, strict=True)]
+    def _touch(self, link_matrices: Array) -> tuple[Array, _Felt]:
+        """(E, P) probes on, and the probes near the surface with what their contact points need."""
+        xp, backend = self._xp, self.backend
+        # Into the object's frame: exact, since a turn is a signed permutation and the other products are zero.
+        turned = (self._turn[:, None, :, :, None] * link_matrices[:, :, :, None, :]).sum(2)
+        placed = self._probes.place(turned)
+        u = [(p - o) * self._inverse_spacing for p, o in zip(placed, self._origin, strict=True)]
         nearest = self._offset
         for axis in range(3):
-            cell = self.backend.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
-            nearest = nearest + self.backend.integer(cell) * self._stride[axis]
-        near = self.backend.take(self.atlas.values, nearest) <= self._probe_reach + self._cull_margin
-        rows, columns = self.backend.select(near)
+            cell = backend.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
+            nearest = nearest + backend.integer(cell) * self._stride[axis]
+        near = backend.take(self.atlas.values, nearest) <= self._probe_reach + self._cull_margin
+        rows, columns = backend.select(near)
         cells = _Cells(self, [c[rows, columns] for c in u], rows)
-        felt = cells.value() <= self._probe_reach[columns]
-        on = self.backend.zeros(near.shape, bool)
-        on[rows, columns] = felt & near[rows, columns]
-        return on, u
+        flags = (cells.value <= self._probe_reach[columns]) & near[rows, columns]
+        on = backend.zeros(near.shape, bool)
+        on[rows, columns] = flags
+        return on, _Felt(rows, columns, flags, [p[rows, columns] for p in placed], cells)
 
-    def _touch_voxels(self, on: Array, new: Array, u: list[Array], step: Array) -> tuple[Array, Array, Array]:
-        backend, xp = self.backend, self._xp
-        rows, columns = backend.select(on)
-        flags = on[rows, columns]
-        cells = _Cells(self, [c[rows, columns] for c in u], rows)
-        distance, gradient = cells.value(), cells.unit_gradient()
-        world = []
-        object_points = [
-            (c * self._spacing[rows, 0] + o[rows, 0]) - distance * g
-            for c, o, g in zip([c[rows, columns] for c in u], self._origin, gradient, strict=True)
+    def _touch_voxels(self, felt: _Felt, new: Array, step: Array) -> tuple[Array, Array, Array]:
+        backend, xp, rows = self.backend, self._xp, felt.rows
+        gradient = felt.cells.unit_gradient()
+        on_surface = [p - felt.cells.value * g for p, g in zip(felt.placed, gradient, strict=True)]
+        turn = self._turn[rows]
+        world = [
+            turn[:, a, 0] * on_surface[0] + turn[:, a, 1] * on_surface[1] + turn[:, a, 2] * on_surface[2]
+            for a in range(3)
         ]
-        for axis in range(3):
-            turn = self._turn[axis]
-            world.append(
-                turn[0][rows, 0] * object_points[0]
-                + turn[1][rows, 0] * object_points[1]
-                + turn[2][rows, 0] * object_points[2]
-            )
-        key = self._voxel_key(world, self._env_base[rows, 0])
-        key = xp.where(flags, key, self.num_envs * VOXELS)
+        key = xp.where(felt.flags, self._voxel_key(world, self._env_base[rows, 0]), self.num_envs * VOXELS)
         fresh = self._first_of_each(self._touched, key)
         backend.put(self._touched_step, xp.where(fresh, key, self.num_envs * VOXELS), backend.int16(step[rows]))
         self._touched_step[-1] = -1
         backend.put(self._touched, key, True)
         self._touched[-1] = False
         new_touched = backend.count_rows(fresh, rows, self.num_envs)
-        points, mask = self._new_points(world, flags & new[rows, columns], rows)
+        points, mask = self._new_points(world, felt.flags & new[rows, felt.columns], rows)
         return new_touched, points, mask
 
     def _new_points(self, world: list[Array], flags: Array, rows: Array) -> tuple[Array, Array]:
@@ -267,26 +257,12 @@ class TactileSensing:
             points[rows, slot, axis] = world[axis]
         return points[:, :MAX_NEW_CONTACTS], mask[:, :MAX_NEW_CONTACTS]
 
-    def _visit_voxels(self, components: Array) -> Array:
-        placed = self._volume.place(
-            components.transpose(2, 0, 1) if self.backend.is_numpy else components.permute(2, 0, 1)
-        )
-        key = self._voxel_key(placed, self._env_base)
+    def _visit_voxels(self, link_matrices: Array) -> Array:
+        key = self._voxel_key(self._volume.place(link_matrices), self._env_base)
         fresh = self._first_of_each(self._visited, key)
         self.backend.put(self._visited, key, True)
         self._visited[-1] = False
         return fresh.sum(1)
-
-    def _to_object_frame(self, components: Array) -> Array:
-        """(12, E, L) link poses turned into the object's frame; exact, since turns are signed permutations."""
-        parts = [components[:, :, k] for k in range(12)]
-        turned: list[Array] = [None] * 12
-        for column in range(4):
-            world = [parts[4 * row + column] for row in range(3)]
-            for row in range(3):  # transpose of the turn: world -> object
-                turn = [self._turn[k][row] for k in range(3)]
-                turned[4 * row + column] = turn[0] * world[0] + turn[1] * world[1] + turn[2] * world[2]
-        return self._xp.stack(turned, 0)
 
     def _voxel_key(self, points: list[Array], base: Array) -> Array:
         """Flat voxel index of points, or the spare last element where they lie outside W."""
@@ -320,18 +296,40 @@ class _BoundPoints:
         self._link = backend.array(points.link)
         self._local = [backend.array(np.ascontiguousarray(points.position[:, a])) for a in range(3)]
 
-    def place(self, components: Array) -> list[Array]:
-        """World coordinates, three (E, P) arrays, for (12, E, L) link poses (rows of [R | t])."""
-        parts = self._backend.take_last(components, self._link)
+    def place(self, link_matrices: Array) -> list[Array]:
+        """Coordinates, three (E, P) arrays, for link poses (E, L, 3, 4)."""
+        parts = self._backend.link_components(link_matrices)
+        taken = self._backend.take_last(parts, self._link)
         x, y, z = self._local
         return [
-            parts[4 * row] * x + parts[4 * row + 1] * y + parts[4 * row + 2] * z + parts[4 * row + 3]
+            taken[4 * row] * x + taken[4 * row + 1] * y + taken[4 * row + 2] * z + taken[4 * row + 3]
             for row in range(3)
         ]
 
 
+@dataclass(frozen=True)
+class _Felt:
+    """Probes near the surface: a list of them, in order of environment and probe.
+
+    Attributes:
+        rows, columns: environment and probe of each.
+        flags: whether it is on.
+        placed: three coordinate arrays in the object's frame (m).
+        cells: the field around it.
+    """
+
+    rows: Array
+    columns: Array
+    flags: Array
+    placed: list[Array]
+    cells: _Cells
+
+
 class _Cells:
-    """Trilinear interpolation of the fields at a list of points: grid coordinates ``u``, environments ``rows``."""
+    """Trilinear interpolation of the fields at a list of points: grid coordinates ``u``, environments ``rows``.
+
+    ``value`` is the signed distance (m).
+    """
 
     def __init__(self, sensing: TactileSensing, u: list[Array], rows: Array) -> None:
         xp, backend = sensing._xp, sensing.backend
@@ -351,9 +349,9 @@ class _Cells:
                     at = index + i * strides[0] + j * strides[1] + k * strides[2]
                     corner[i, j, k] = backend.take(values, at)
         self._corner = corner
+        self.value = self._interpolate()
 
-    def value(self) -> Array:
-        """Signed distance (m)."""
+    def _interpolate(self) -> Array:
         c, (fx, fy, fz) = self._corner, self._fraction
         along_x = {(j, k): c[0, j, k] + fx * (c[1, j, k] - c[0, j, k]) for j in (0, 1) for k in (0, 1)}
         along_y = {k: along_x[0, k] + fy * (along_x[1, k] - along_x[0, k]) for k in (0, 1)}

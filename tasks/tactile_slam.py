@@ -23,6 +23,7 @@ from tslam_bench import grids
 from tslam_bench.assets.hand import load_hand
 from tslam_bench.assets.store import PreparedObject, list_objects, load_object
 from tslam_bench.constants import (
+    CONTROL_STEP_SECONDS,
     ENVIRONMENT_ID,
     GRID_SIZE,
     HORIZON,
@@ -191,7 +192,7 @@ class TactileSLAMEnv(BaseEnv):
     @property
     def control_timestep(self) -> float:
         """Control timestep (s)."""
-        return SUBSTEPS / PHYSICS_FREQUENCY
+        return CONTROL_STEP_SECONDS
 
     @cached_property
     def single_observation_space(self) -> spaces.Space:

@@ -36,6 +36,8 @@ PHYSICS_FREQUENCY: Final = 133
 """Physics steps per second."""
 SUBSTEPS: Final = 4
 """Physics steps per control step (30.1 ms)."""
+CONTROL_STEP_SECONDS: Final = SUBSTEPS / PHYSICS_FREQUENCY
+"""Duration of a control step (s)."""
 HORIZON: Final = 200
 """Control steps per episode (6.0 s)."""
 

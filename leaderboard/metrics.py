@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 
@@ -67,6 +67,45 @@ def sample_surface(
     return points, cross[face] / length[face, None]
 
 
+class NearestSamples:
+    """Exact nearest neighbours among surface samples.
+
+    A bounding-volume hierarchy, not a k-d tree: the boxes of a k-d tree's splits do not hug a flat face that is parallel
+    to an axis, and a query a few millimetres off such a face then visits most of it (30 times slower on a box). Samples
+    and queries are visited in Morton order, which keeps the memory that neighbours share in the cache (4 times faster).
+    """
+
+    def __init__(self, points: NDArray) -> None:
+        """Args: points: (M, 3), not empty."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+            raise ValueError(f"NearestSamples: shape {points.shape}; expected (M, 3) with at least one sample")
+        self._order = morton_order(points)
+        self._sorted = points[self._order]
+        self._elements = np.arange(len(points), dtype=np.int64)[:, None]
+        self._tree = igl.AABB()
+        self._tree.init(self._sorted, self._elements)
+
+    def query(self, other: NearestSamples) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distance (Q,) from each sample of ``other`` to the nearest of these, and the index (Q,) of that one."""
+        squared, index, _ = self._tree.squared_distance(self._sorted, self._elements, other._sorted)
+        distance, nearest = np.empty(len(squared)), np.empty(len(squared), dtype=np.int64)
+        distance[other._order] = np.sqrt(squared)
+        nearest[other._order] = self._order[index]
+        return distance, nearest
+
+
+def morton_order(points: NDArray) -> NDArray[np.int64]:
+    """Permutation (M,) that sorts ``points`` (M, 3) along a Morton curve of 1024 cells per axis of their bounding box."""
+    low, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-12)
+    cells = np.clip((points - low) / extent * 1023, 0, 1023).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
 @dataclass(frozen=True)
 class SurfaceMatch:
     """Nearest neighbours between samples of a predicted and of a true surface.
@@ -84,20 +123,12 @@ class SurfaceMatch:
     nearest_predicted: NDArray[np.int64]
 
 
-def match_surfaces(
-    predicted: NDArray, true: NDArray, true_tree: cKDTree | None = None, workers: int = 1
-) -> SurfaceMatch:
-    """Nearest neighbours both ways between samples (P, 3) and (T, 3) in metric units.
-
-    Args:
-        true_tree: ``cKDTree(true)`` if it is at hand.
-        workers: threads of the query; the result does not depend on it.
-    """
-    if len(predicted) == 0 or len(true) == 0:
-        raise ValueError("match_surfaces: a surface without samples has no neighbours; use the worst values instead")
-    true_tree = cKDTree(true) if true_tree is None else true_tree
-    accuracy, nearest_true = true_tree.query(predicted, workers=workers)
-    completeness, nearest_predicted = cKDTree(predicted).query(true, workers=workers)
+def match_surfaces(predicted: NDArray | NearestSamples, true: NDArray | NearestSamples) -> SurfaceMatch:
+    """Nearest neighbours both ways between samples (P, 3) and (T, 3) in metric units, or their search structures."""
+    predicted = predicted if isinstance(predicted, NearestSamples) else NearestSamples(predicted)
+    true = true if isinstance(true, NearestSamples) else NearestSamples(true)
+    accuracy, nearest_true = true.query(predicted)
+    completeness, nearest_predicted = predicted.query(true)
     return SurfaceMatch(
         accuracy=np.minimum(accuracy, WORST_DISTANCE),
         completeness=np.minimum(completeness, WORST_DISTANCE),

@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
 from tslam_bench import __version__, grids
 from tslam_bench.assets.contactdb import OBJECTS
@@ -53,8 +52,8 @@ CURVE_SPACING: Final = 10
 """Control steps between the stored samples of an exploration curve."""
 VOXEL_HALF_DIAGONAL: Final = VOXEL_EDGE * np.sqrt(3) / 2
 PLAUSIBLE_SLACK: Final = 2e-3
-"""A touched voxel holds a contact point, which lies on the collision hulls; this much (m) is allowed for the error of the
-field and for the linear step from probe to surface."""
+"""A touched voxel holds a contact point, which lies on the collision hulls; this much (m) is allowed for the error of
+the field and for the linear step from probe to surface."""
 
 SHAPE_METRICS: Final = {
     "iou": 0.0,
@@ -78,15 +77,14 @@ class Truth:
     """Ground truth of one object with what is computed once for all submissions."""
 
     prepared: PreparedObject
-    surface: NDArray[np.float64]
-    tree: cKDTree
+    surface: metrics.NearestSamples
     coverage: metrics.TouchCoverage
 
     @staticmethod
     def of(prepared: PreparedObject) -> Truth:
         """Ground truth from a prepared object."""
-        surface = metrics.to_metric(prepared.surface_points)
-        return Truth(prepared, surface, cKDTree(surface), metrics.TouchCoverage(prepared.surface_points))
+        surface = metrics.NearestSamples(metrics.to_metric(prepared.surface_points))
+        return Truth(prepared, surface, metrics.TouchCoverage(prepared.surface_points))
 
 
 @lru_cache(maxsize=8)
@@ -103,8 +101,8 @@ class ObjectScore:
         object, seed: what was scored.
         protocols: ``"4"`` and ``"8"`` -> metric -> value; touch metrics are None for a reference without rollouts.
         reasons: ``"4"`` and ``"8"`` -> why the reconstruction counts as empty, or None.
-        poses: ``"1"``, ``"2"``, ``"4"``, ``"8"`` -> recall and surface IoU after so many poses of the exploration order,
-            and IoU where a reconstruction is there.
+        poses: ``"1"``, ``"2"``, ``"4"``, ``"8"`` -> recall and surface IoU after so many poses of the exploration
+            order, and IoU where a reconstruction is there.
         recall_curve, surface_iou_curve: values every ``CURVE_SPACING`` control steps over all eight poses, from step 0.
         exploration: areas under the two curves (from every step).
         implausible_touches: share of touched voxels that cannot hold a point of the object's surface.
@@ -315,7 +313,7 @@ def score_reconstruction(reconstruction: Reconstruction | None, truth: Truth) ->
     prediction = prepare(reconstruction, iou_points())
     if prediction.reason is not None:
         return dict(SHAPE_METRICS), prediction.reason
-    match = metrics.match_surfaces(metrics.to_metric(prediction.points), truth.surface, truth.tree)
+    match = metrics.match_surfaces(metrics.to_metric(prediction.points), truth.surface)
     return {
         "iou": metrics.iou(prediction.solid, prepared.solid_at_iou_points),
         "iou_raw": metrics.iou(prediction.solid, prepared.raw_solid_at_iou_points),

@@ -147,7 +147,7 @@ def test_no_valid_prediction_is_charged_more_than_an_empty_one() -> None:
 
 
 def test_match_refuses_nothing() -> None:
-    with pytest.raises(ValueError, match="without samples"):
+    with pytest.raises(ValueError, match="at least one sample"):
         metrics.match_surfaces(np.zeros((0, 3)), np.zeros((5, 3)))
 
 

@@ -1,0 +1,268 @@
+"""Scoring end to end on objects made from primitives: known answers, missing pieces, frames."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from objects import surface_grid
+
+from tslam_bench import __version__, grids
+from tslam_bench.constants import HORIZON, WORKSPACE_EDGE
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.leaderboard import metrics
+from tslam_bench.leaderboard.info import SubmissionInfo
+from tslam_bench.leaderboard.scoring import (
+    SHAPE_METRICS,
+    SubmissionScore,
+    Truth,
+    aggregate,
+    implausible_touches,
+    merge_touched_steps,
+    score_object,
+    score_reconstruction,
+)
+from tslam_bench.leaderboard.submission import (
+    EXPLORATION_ORDER,
+    RECONSTRUCTED_POSES,
+    Submission,
+    SubmissionWriter,
+    read_submission,
+)
+from tslam_bench.reconstruction.volume import Volume
+
+INFO = SubmissionInfo(
+    method="Test",
+    explorer="test",
+    reconstructor="truth",
+    authors=("A",),
+    asset_manifest_sha256="0" * 64,
+    seeds=(0, 1),
+    object_set="quick",
+    privileged=False,
+    package_version=__version__,
+)
+
+
+@pytest.fixture(scope="module")
+def truth(box) -> Truth:
+    return Truth.of(box)
+
+
+def explored(surface: np.ndarray, pose: int, share: float, seed: int) -> dict[str, np.ndarray]:
+    """Arguments of add_rollout: a random share of the surface voxels, in the world frame of the pose."""
+    generator = np.random.default_rng([pose, seed])
+    world = grids.object_to_world(surface, pose)
+    touched = world & (generator.random(world.shape) < share)
+    return {
+        "actions": generator.uniform(-1, 1, (200, 28)).astype(np.float32),
+        "touched": touched,
+        "visited": ~world,
+        "touched_step": np.where(touched, generator.integers(0, 200, world.shape), -1).astype(np.int16),
+    }
+
+
+def submission(folder: Path, box, info: SubmissionInfo = INFO, skip: tuple[str, ...] = ()) -> Submission:
+    """All of one object; ``skip`` names files to leave out."""
+    mesh = trimesh.Trimesh(box.vertices, box.faces)
+    with SubmissionWriter(folder, info) as writer:
+        for seed in info.seeds:
+            for pose in range(8):
+                writer.add_rollout(box.name, pose, seed, **explored(surface_grid(box), pose, 0.1, seed))
+            for protocol in RECONSTRUCTED_POSES:
+                writer.add_reconstruction(box.name, protocol, seed, mesh)
+    for name in skip:
+        (folder / name).unlink()
+    return read_submission(folder, objects=[box.name])
+
+
+# --- One reconstruction ----------------------------------------------------------------------------------------
+
+
+def test_the_truth_scores_full_marks(truth: Truth, box) -> None:
+    values, reason = score_reconstruction(trimesh.Trimesh(box.vertices, box.faces), truth)
+    assert reason is None
+    assert values["iou"] == values["iou_raw"] == values["f_score_1"] == values["f_score_2"] == 1
+    area = trimesh.Trimesh(box.vertices, box.faces).area / WORKSPACE_EDGE**2
+    assert values["chamfer_l2"] == pytest.approx(area / (np.pi * 100_000), rel=0.05)
+    assert values["normal_consistency"] > 0.99
+
+
+def test_a_translated_box(truth: Truth, box) -> None:
+    """IoU = (l - d) / (l + d). The faces that slide in their own plane stay where they are but for a rim; the two faces
+    across the shift are d away: bounds on Chamfer-L1."""
+    shift = 0.01
+    mesh = trimesh.Trimesh(box.vertices + np.array([shift, 0, 0]), box.faces)
+    values, _ = score_reconstruction(mesh, truth)
+    length, width, height = np.ptp(box.vertices, axis=0)
+    assert values["iou"] == pytest.approx((length - shift) / (length + shift), abs=0.01)
+    share_across = 2 * width * height / mesh.area
+    assert share_across * shift / WORKSPACE_EDGE < values["chamfer_l1"] < shift / WORKSPACE_EDGE
+
+
+def test_an_empty_reconstruction_scores_the_worst(truth: Truth) -> None:
+    for nothing in (None, Volume(np.zeros((4, 4, 4))), trimesh.creation.box(extents=[2, 2, 2])):
+        values, reason = score_reconstruction(nothing, truth)
+        assert values == SHAPE_METRICS
+        assert reason
+    assert SHAPE_METRICS["chamfer_l2"] == pytest.approx(3) and SHAPE_METRICS["chamfer_l1"] == pytest.approx(3**0.5)
+
+
+def test_worse_shapes_score_worse(truth: Truth, box) -> None:
+    scores = []
+    for factor in (1.0, 1.1, 1.3, 1.6):
+        values, _ = score_reconstruction(trimesh.Trimesh(box.vertices * factor, box.faces), truth)
+        scores.append(values)
+    assert np.all(np.diff([s["iou"] for s in scores]) < 0)
+    assert np.all(np.diff([s["chamfer_l2"] for s in scores]) > 0)
+    assert np.all(np.diff([s["f_score_2"] for s in scores]) <= 0)
+    assert scores[2]["iou"] == pytest.approx(1 / 1.3**3, abs=0.01)
+
+
+# --- One object of a submission --------------------------------------------------------------------------------
+
+
+def test_complete_submission(tmp_path: Path, truth: Truth, box) -> None:
+    results = score_object(submission(tmp_path / "s", box), truth)
+    assert [r.seed for r in results] == [0, 1]
+    for result in results:
+        assert result.missing == [] and result.implausible_touches == 0
+        assert result.reasons == {"4": None, "8": None}
+        assert result.protocols["8"]["iou"] == 1
+        assert [result.poses[n]["iou"] for n in ("1", "2", "4", "8")] == [1, 1, 1, 1]
+        recalls = [result.poses[n]["touched_surface_recall"] for n in ("1", "2", "4", "8")]
+        assert np.all(np.diff(np.array(recalls, dtype=float)) > 0)
+        # The curve every 10 steps passes through the values after 1, 2, 4 and 8 poses.
+        assert len(result.recall_curve) == len(result.surface_iou_curve) == 161
+        assert np.array(result.recall_curve)[[20, 40, 80, 160]] == pytest.approx(recalls, abs=1e-5)
+        surface = [result.poses[n]["surface_iou"] for n in ("1", "2", "4", "8")]
+        assert np.array(result.surface_iou_curve)[[20, 40, 80, 160]] == pytest.approx(surface, abs=1e-5)
+        assert result.exploration["exploration_area"] == pytest.approx(np.mean(result.recall_curve), abs=0.01)
+
+
+def test_poses_are_turned_back_before_they_are_merged(tmp_path: Path, truth: Truth, box) -> None:
+    """Touched voxels of every pose land on the object; merged by hand from the definition of a pose."""
+    result = score_object(submission(tmp_path / "s", box), truth)[0]
+    touched = np.zeros((32, 32, 32), dtype=bool)
+    centres = grids.voxel_centres()
+    for pose in EXPLORATION_ORDER[:4]:
+        world = explored(surface_grid(box), pose, 0.1, 0)["touched"]
+        touched |= grids.points_to_grid(centres[world] @ grids.pose_rotation(pose))  # rows: R^T p
+    assert result.protocols["4"]["surface_iou"] == pytest.approx(metrics.surface_iou(touched, box.surface))
+    assert result.protocols["4"]["touched_surface_recall"] == pytest.approx(truth.coverage.recall(touched))
+
+
+def test_first_touch_counts_and_missing_poses_take_their_time(tmp_path: Path, box) -> None:
+    source = submission(tmp_path / "s", box)
+    rollouts = {pose: source.rollout(box.name, pose, 0) for pose in EXPLORATION_ORDER}
+    merged = merge_touched_steps({**rollouts, EXPLORATION_ORDER[0]: None})
+    assert merged[merged >= 0].min() >= HORIZON
+    assert merged.max() < 8 * HORIZON
+    voxel = np.argwhere(merged >= 0)[0]
+    first = None
+    for position, pose in enumerate(EXPLORATION_ORDER):
+        if position == 0:
+            continue
+        world = grids.pose_rotation(pose) @ (voxel - 15.5) + 15.5
+        step = rollouts[pose].touched_step[tuple(world.round().astype(int))]
+        if step >= 0:
+            first = position * HORIZON + step
+            break
+    assert merged[tuple(voxel)] == first
+
+
+def test_missing_reconstruction_counts_as_empty(tmp_path: Path, truth: Truth, box) -> None:
+    results = score_object(submission(tmp_path / "s", box, skip=("reconstructions/box_8_seed1.ply",)), truth)
+    assert results[0].protocols["8"]["iou"] == 1
+    assert results[1].protocols["8"]["iou"] == 0
+    assert results[1].protocols["8"]["chamfer_l2"] == pytest.approx(3)
+    assert results[1].reasons == {"4": None, "8": "missing"}
+    assert results[1].missing == ["reconstruction of 8 poses"]
+    assert aggregate(results, 1)["8"]["iou"].mean == 0.5
+
+
+def test_reconstruction_without_its_rollouts_counts_as_empty(tmp_path: Path, truth: Truth, box) -> None:
+    """Pose 1 is in the 8-pose protocol only."""
+    result = score_object(submission(tmp_path / "s", box, skip=("rollouts/box/pose1_seed0.npz",)), truth)[0]
+    assert result.protocols["4"]["iou"] == 1
+    assert result.protocols["8"]["iou"] == 0
+    assert result.reasons["8"] == "rollouts of poses 1 are missing"
+    assert result.missing == ["rollout of pose 1"]
+
+
+def test_optional_reconstructions_are_not_missed(tmp_path: Path, truth: Truth, box) -> None:
+    skip = ("reconstructions/box_1_seed0.ply", "reconstructions/box_2_seed0.ply")
+    result = score_object(submission(tmp_path / "s", box, skip=skip), truth)[0]
+    assert result.missing == []
+    assert [result.poses[n]["iou"] for n in ("1", "2", "4", "8")] == [None, None, 1, 1]
+
+
+def test_reference_without_rollouts_is_scored_by_shape_only(tmp_path: Path, truth: Truth, box) -> None:
+    info = replace(INFO, explorer="oracle", privileged=True, seeds=(0,))
+    with SubmissionWriter(tmp_path / "s", info) as writer:
+        writer.add_reconstruction("box", 8, 0, Volume(box.solid.astype(np.float32), "nearest"))
+    result = score_object(read_submission(tmp_path / "s", objects=["box"]), truth)[0]
+    assert result.protocols["8"]["iou"] == pytest.approx(metrics.iou(box.solid, box.solid), abs=0.2)
+    assert result.protocols["8"]["surface_iou"] is None
+    assert result.exploration["exploration_area"] is None
+    estimates = aggregate([result], 1)
+    assert "surface_iou" not in estimates["8"] and "iou" in estimates["8"] and estimates["exploration"] == {}
+
+
+def test_touches_far_from_the_object_are_found(box) -> None:
+    near = surface_grid(box)
+    assert implausible_touches(near, box) == 0
+    far = np.zeros((32, 32, 32), dtype=bool)
+    far[0, 0, 0] = far[31, 16, 16] = True  # outside the field's padding
+    far[16, 16, 16] = True  # deep inside the box
+    assert implausible_touches(far, box) == 1
+    assert implausible_touches(near | far, box) == pytest.approx(3 / (near.sum() + 3))
+    assert implausible_touches(np.zeros_like(far), box) == 0
+    # One voxel beyond the touching layer is already too far along a face normal.
+    shifted = np.zeros_like(near)
+    top = np.argwhere(near[16, 16]).max()
+    shifted[16, 16, min(top + 3, 31)] = True
+    assert implausible_touches(shifted, box) == 1
+
+
+def test_score_files_round_trip(tmp_path: Path, truth: Truth, box) -> None:
+    source = submission(tmp_path / "s", box)
+    results = score_object(source, truth)
+    score = SubmissionScore(INFO, source.content_hash, ("box",), tuple(results), aggregate(results, 1), ("a note",))
+    text = json.dumps(score.to_json(), allow_nan=False)
+    again = SubmissionScore.from_json(json.loads(text), "file")
+    assert again.to_json() == score.to_json()
+    np.testing.assert_array_equal(score.matrix("iou", 8), [[1, 1]])
+    assert not again.verified
+    others: list = [None, [], {}, {"score_version": 1}, json.loads(text) | {"score_version": 0}]
+    for broken in others:
+        with pytest.raises(InvalidInputError, match="score the submission again"):
+            SubmissionScore.from_json(broken, "file")
+
+
+def test_scoring_is_deterministic(tmp_path: Path, truth: Truth, box) -> None:
+    source = submission(tmp_path / "s", box)
+    assert score_object(source, truth) == score_object(source, truth)
+
+
+# --- Imports ---------------------------------------------------------------------------------------------------
+
+
+def test_leaderboard_needs_no_simulator_and_no_torch() -> None:
+    """Every module of the leaderboard, imported in a fresh interpreter."""
+    code = """
+import importlib, pkgutil, sys
+import tslam_bench.leaderboard as package
+for module in pkgutil.iter_modules(package.__path__):
+    importlib.import_module(f"{package.__name__}.{module.name}")
+heavy = {"torch", "sapien", "mani_skill", "stable_baselines3", "mujoco", "coacd", "tensorboard"}
+print(sorted({name.partition(".")[0] for name in sys.modules} & heavy))
+"""
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "[]"

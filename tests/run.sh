@@ -34,4 +34,5 @@ step "$PYTHON" -m ruff check .
 step "$PYTHON" -m ruff format --check .
 step bash tests/typecheck.sh
 step "$PYTHON" -m tslam_bench.cli assets prepare --quick
+step "$PYTHON" docs/build_environment.py --check
 step "$PYTHON" -m pytest "${markers[@]}" "$@"

@@ -1,0 +1,88 @@
+"""Writes docs/environment.md from the environment's own spaces and constants.
+
+    python docs/build_environment.py           # write
+    python docs/build_environment.py --check   # fail if the file is out of date
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import tyro
+
+import tslam_bench  # noqa: F401  (registers the environment)
+from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.files import atomic_file
+from tslam_bench.hand_constants import SKIN_LINKS
+from tslam_bench.tasks.commands import action_rows, environment_rows, observation_rows, reward_rows
+
+TARGET = Path(__file__).parent / "environment.md"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Writes or checks docs/environment.md."""
+
+    check: bool = False
+    """Only compare; exit with status 1 if the file is out of date."""
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    lines += ["| " + " | ".join(_cell(value) for value in row.values()) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else f"`{value}`" if isinstance(value, str) else str(value)
+
+
+def page() -> str:
+    """The page's text."""
+    environment = gymnasium.make(ENVIRONMENT_ID, object="mug")
+    manual = inspect.cleandoc(type(environment.unwrapped).__doc__ or "")
+    observations = observation_rows(environment)
+    environment.close()
+    parts = [
+        "# Environment",
+        "<!-- Written by docs/build_environment.py: change the code, not this page. -->",
+        "## Registered ids",
+        table(environment_rows()),
+        f"## `{ENVIRONMENT_ID}`",
+        f"```text\n{manual}\n```",
+        "## Observations",
+        "Per environment; every value is batched `(num_envs, ...)`. `touch` follows the order of the skin links: "
+        + ", ".join(f"`{name}`" for name in SKIN_LINKS)
+        + ".",
+        table(observations),
+        "## Actions",
+        "One number in [-1, 1] per joint. `delta_per_step` is the change of the target at action 1 in `pd_joint_delta_pos`.",
+        table(action_rows()),
+        "## Reward modes",
+        table(reward_rows()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def main(config: Config) -> None:
+    """Writes the page, or compares it."""
+    text = page()
+    if config.check:
+        if not TARGET.exists() or TARGET.read_text(encoding="utf-8") != text:
+            sys.exit("docs/environment.md is out of date; run 'python docs/build_environment.py'")
+        return
+    with atomic_file(TARGET) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -53,7 +53,7 @@ def read_grids(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in ("touched", "visited") if name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile, AttributeError, TypeError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else "not an .npz file of plain arrays"
         raise InvalidInputError(f"{path}: {reason}; {_REMEDY}") from error
     if "touched" not in arrays:

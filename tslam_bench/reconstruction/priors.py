@@ -5,14 +5,12 @@ They bound from below what completing a shape by learning should bring.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import OCCUPANCY_THRESHOLD
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.reconstruction.inputs import GRID_SHAPE, check_grids, empty_volume
@@ -23,10 +21,11 @@ FAR_VOXELS: Final = 3.0
 """A touched voxel at least this far (voxel edges) from a shape's surface speaks against it with full weight."""
 
 
-def _solids(objects: Sequence[PreparedObject]) -> NDArray[np.bool_]:
-    if not objects:
-        raise InvalidInputError("training objects: none; prepare some with `tslam-bench assets prepare --split train`")
-    return np.stack([item.solid for item in objects])
+def _check_shapes(name: str, grids: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    grids = np.asarray(grids, dtype=bool)
+    if grids.ndim != 4 or len(grids) == 0 or grids.shape[1:] != GRID_SHAPE:
+        raise InvalidInputError(f"training {name}: shape {grids.shape}; give at least one (32, 32, 32) grid, stacked")
+    return grids
 
 
 class MeanShapeReconstructor:
@@ -37,16 +36,16 @@ class MeanShapeReconstructor:
     in half of all shapes.
 
     Args:
-        objects: training objects.
+        solids: (S, 32, 32, 32) bool, the training objects' solid voxels.
 
     Raises:
-        InvalidInputError: there are none.
+        InvalidInputError: no grid, or another shape.
     """
 
     name = "mean_shape"
 
-    def __init__(self, objects: Sequence[PreparedObject]) -> None:
-        solids = _solids(objects)
+    def __init__(self, solids: NDArray[np.bool_]) -> None:
+        solids = _check_shapes("solids", solids)
         share = solids.mean(axis=0)
         levels = np.unique(share[share > 0])
         if len(levels) == 0:
@@ -55,9 +54,10 @@ class MeanShapeReconstructor:
         scores = []
         for level in levels:
             solid = share >= level
-            scores.append(np.mean((solids & solid).sum(axis=(1, 2, 3)) / (solids | solid).sum(axis=(1, 2, 3))))
-        self.level = float(levels[int(np.argmax(scores))])
-        probability = np.interp(share, [0.0, self.level, max(1.0, self.level + 1e-9)], [0.0, OCCUPANCY_THRESHOLD, 1.0])
+            either = np.maximum((solids | solid).sum(axis=(1, 2, 3)), 1)
+            scores.append(np.mean((solids & solid).sum(axis=(1, 2, 3)) / either))
+        level = float(levels[int(np.argmax(scores))])
+        probability = np.interp(share, [0.0, level, max(1.0, level + 1e-9)], [0.0, OCCUPANCY_THRESHOLD, 1.0])
         self._volume = Volume(probability, "linear")
 
     def reconstruct(self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]) -> Volume:
@@ -74,18 +74,21 @@ class RetrievalReconstructor:
     to the solid's size. Nothing touched: empty, since nothing was felt that could be looked up.
 
     Args:
-        objects: training objects.
+        solids: (S, 32, 32, 32) bool, the training objects' solid voxels.
+        surfaces: (S, 32, 32, 32) bool, the voxels that their surfaces cross.
 
     Raises:
-        InvalidInputError: there are none.
+        InvalidInputError: no grid, other shapes, or not as many surfaces as solids.
     """
 
     name = "retrieval"
 
-    def __init__(self, objects: Sequence[PreparedObject]) -> None:
-        self._solids = _solids(objects)
-        self.objects = [item.name for item in objects]
-        distances = [distance_transform_edt(~item.surface) for item in objects]
+    def __init__(self, solids: NDArray[np.bool_], surfaces: NDArray[np.bool_]) -> None:
+        self._solids = _check_shapes("solids", solids)
+        surfaces = _check_shapes("surfaces", surfaces)
+        if len(surfaces) != len(self._solids):
+            raise InvalidInputError(f"training surfaces: {len(surfaces)} for {len(self._solids)} solids; give one each")
+        distances = [distance_transform_edt(~surface) for surface in surfaces]
         self._surface_cost = (np.minimum(np.stack(distances), FAR_VOXELS) / FAR_VOXELS).astype(np.float32)
         sizes = np.maximum(self._solids.sum(axis=(1, 2, 3)), 1)
         self._solid_cost = (self._solids / sizes[:, None, None, None]).astype(np.float32)

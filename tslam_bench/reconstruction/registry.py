@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.reconstruction.volume import Reconstructor
 
@@ -93,7 +95,10 @@ def make_reconstructor(
         from tslam_bench.reconstruction.training_objects import load_training_objects
 
         objects = load_training_objects(split, cache=cache)
-        return MeanShapeReconstructor(objects) if name == "mean_shape" else RetrievalReconstructor(objects)
+        solids = np.stack([item.solid for item in objects])
+        if name == "mean_shape":
+            return MeanShapeReconstructor(solids)
+        return RetrievalReconstructor(solids, np.stack([item.surface for item in objects]))
     from tslam_bench.reconstruction.learned import load_reconstructor
 
     assert model is not None

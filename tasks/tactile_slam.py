@@ -69,7 +69,7 @@ class TactileSLAMEnv(BaseEnv):
     ``"pd_joint_pos"`` maps [-1, 1] to the joint limits.
 
     **Observations** (a dict of batched tensors, E environments): ``qpos`` (E, 28) and ``qvel`` (E, 28) in m, rad and per
-    second; ``touch`` (E, 17) 0/1 per skin link; ``occupancy`` (E, 2, 32, 32, 32) 0/1, channel 0 touched and channel 1
+    second; ``touch`` (E, 18) 0/1 per skin link; ``occupancy`` (E, 2, 32, 32, 32) 0/1, channel 0 touched and channel 1
     visited since the episode began; ``time`` (E, 1) elapsed fraction. ``obs_mode="state"`` flattens them.
 
     **Rewards.** ``reward_mode`` is one of ``tslam_bench.constants.REWARD_MODES`` (section 7), or ``"none"``.
@@ -127,6 +127,12 @@ class TactileSLAMEnv(BaseEnv):
             raise InvalidInputError(f"control_mode {control_mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise InvalidInputError(f"num_envs {num_envs!r}: must be a whole number of at least 1")
+        wants_gpu = num_envs > 1 or "cuda" in str(kwargs.get("sim_backend", ""))
+        if wants_gpu and not torch.cuda.is_available():
+            raise InvalidInputError(
+                f"num_envs {num_envs}, sim_backend {kwargs.get('sim_backend', 'auto')!r}: batched simulation needs a GPU and "
+                "there is none (CUDA); make environments with num_envs=1 instead"
+            )
         if object is not None and objects is not None:
             raise InvalidInputError("object and objects: give one or the other, not both")
         self.split = split

@@ -189,6 +189,11 @@ def test_joints_reach_their_targets():
         ({"object": "mug", "control_mode": "pd_ee_pose"}, "control_mode 'pd_ee_pose': unknown"),
         ({"object": "mug", "objects": ("mug",)}, "one or the other"),
         ({"object": "mug", "num_envs": 0}, "num_envs 0"),
+        pytest.param(
+            {"object": "mug", "num_envs": 2},
+            "needs a GPU and there is none",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, so this is no error"),
+        ),
     ],
 )
 def test_bad_arguments_get_one_line(arguments, message):

@@ -27,13 +27,12 @@ from tslam_bench.baselines.learned import METADATA_FILE, MODEL_FILE
 from tslam_bench.baselines.registry import BaselineSpec, get_baseline, make_baseline
 from tslam_bench.baselines.rollout import Rollout, roll_out
 from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.leaderboard.info import SubmissionInfo, Training
 from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, SubmissionWriter
-from tslam_bench.reconstruction.grid import GridReconstructor
-from tslam_bench.reconstruction.hull import HullReconstructor
+from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Reconstructor
 
 SOURCE_FILE: Final = "source.json"
@@ -76,19 +75,6 @@ class EvaluationConfig:
 def default_objects(object_set: str) -> tuple[str, ...]:
     """Objects of an object set: the five quick ones, or the test split."""
     return QUICK_OBJECTS if object_set == "quick" else tuple(known_names("test"))
-
-
-def make_reconstructor(name: str, model: Path | None) -> Reconstructor:
-    """One reconstructor by id; see :func:`make_reconstructors`."""
-    if name in ("grid", "hull") and model is None:
-        return GridReconstructor() if name == "grid" else HullReconstructor()
-    if name in ("ifnet", "convonet") and model is not None:
-        from tslam_bench.reconstruction.learned import load_reconstructor
-
-        return load_reconstructor(model)
-    raise InvalidInputError(
-        f"reconstructor {name!r}: unknown, or its model is missing; give grid, hull, or ifnet=MODEL"
-    )
 
 
 def make_reconstructors(specifications: Sequence[str]) -> dict[str, Reconstructor]:
@@ -199,6 +185,18 @@ def reference_grids(identifier: str, object_name: str) -> Grids:
     return prepared.surface.copy(), ~prepared.solid
 
 
+def manifest_sha256(config: EvaluationConfig) -> str:
+    """Hash of the object set's assets; of the evaluated objects alone while the set is not prepared as a whole.
+
+    Raises:
+        AssetError: an evaluated object is not prepared.
+    """
+    try:
+        return asset_sha256(default_objects(config.object_set))
+    except AssetError:
+        return asset_sha256(config.objects)
+
+
 def submission_info(config: EvaluationConfig, reconstructor: str) -> SubmissionInfo:
     """What the submission says about itself; budget and hardware come from the model's metadata."""
     spec = get_baseline(config.baseline)
@@ -216,7 +214,7 @@ def submission_info(config: EvaluationConfig, reconstructor: str) -> SubmissionI
         explorer=spec.id,
         reconstructor=reconstructor,
         authors=("The tslam-bench authors",),
-        asset_manifest_sha256=asset_sha256(config.objects),
+        asset_manifest_sha256=manifest_sha256(config),
         seeds=config.seeds,
         object_set=config.object_set,
         privileged=spec.privileged,

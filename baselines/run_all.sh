@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Runs the whole benchmark on a fresh machine: set-up, assets, training, episodes, reconstruction, scores, page.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+for argument in "$@"; do
+    if [ "$argument" = "-h" ] || [ "$argument" = "--help" ]; then
+        cat <<'USAGE'
+usage: bash baselines/run_all.sh --quick | --tiny | --full [options]
+
+Does its own set-up (virtual environment, dependencies, assets), prints the commands it runs, and leaves
+runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run it again to go on after a stop.
+
+  --quick                five objects, all baselines, a few thousand training steps: 15 minutes on 2 cores
+  --tiny                 one object, five explorers, hardly any training: checks that the path works
+  --full                 the whole test split, three seeds, the paper's training budget: days on a CPU
+
+  --objects NAME ...     test objects instead of the preset's
+  --baselines ID ...     explorers instead of the preset's (tslam-bench baselines list)
+  --seeds N ...          repetitions of every episode
+  --steps N              training steps of each learned baseline
+  --reconstructors ID ...
+                         reconstructors instead of the preset's (tslam-bench reconstruct list)
+  --output FOLDER        folder of the run (default: runs/ and the preset's name)
+  --workers N            processes at a time (default: the cores)
+  --dry-run              print the commands without running them
+  --help                 this text
+USAGE
+        exit 0
+    fi
+done
+
+source ./setup.sh
+set_up_environment
+exec "$PYTHON" -m tslam_bench.baselines.run "$@"

@@ -117,7 +117,6 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
             raise InvalidInputError(f"environment: the episode ended after {step + 1} steps, expected {HORIZON}")
     base = env.unwrapped
     touched_step = to_numpy(base.touched_step)[0].astype(np.int16)  # type: ignore[attr-defined]
-    touched_step[touched_step > 0] -= 1  # the environment counts from 1, submissions from 0
     return Rollout(
         object_name,
         pose,

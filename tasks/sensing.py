@@ -136,7 +136,7 @@ class TactileSensing:
 
     @property
     def touched_step(self) -> Array:
-        """(E, 32, 32, 32) int16, control step (1 = first) of the first touch, -1 where never touched; a view."""
+        """(E, 32, 32, 32) int16, control step (0 = first) of the first touch, -1 where never touched; a view."""
         return self._touched_step[:-1].reshape(self.num_envs, GRID_SIZE, GRID_SIZE, GRID_SIZE)
 
     @property
@@ -182,7 +182,7 @@ class TactileSensing:
 
         Args:
             link_matrices: (E, L, 3, 4) float32, pose of every skin link in the world.
-            step: (E,) int, control steps done in the episode (1 after the first).
+            step: (E,) int, number of the control step in its episode (0 = first).
 
         Returns:
             The step's contacts.

@@ -407,7 +407,7 @@ class TactileSLAMEnv(BaseEnv):
 
     def _step_action(self, action: Any) -> Any:
         action = super()._step_action(action)
-        step = self._elapsed_steps + 1
+        step = self._elapsed_steps  # counted up after the action
         if self.gpu_sim_enabled:
             self._contacts = self._sensing.step(self.agent.device_skin_matrices(), step)
         else:
@@ -477,7 +477,7 @@ class TactileSLAMEnv(BaseEnv):
 
     @property
     def touched_step(self) -> Any:
-        """(E, 32, 32, 32) int16, step (1..200) of the first touch, -1 where never touched; a view."""
+        """(E, 32, 32, 32) int16, step (0..199) of the first touch, -1 where never touched; a view."""
         return self._sensing.touched_step
 
 

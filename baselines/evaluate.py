@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 import tslam_bench
 from tslam_bench.assets.store import asset_sha256, known_names, load_object, resolve_name
-from tslam_bench.baselines.learned import METADATA_FILE, MODEL_FILE
 from tslam_bench.baselines.registry import BaselineSpec, get_baseline, make_baseline
 from tslam_bench.baselines.rollout import Rollout, roll_out
+from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import ensure_writable_directory, sha256_file, write_json

@@ -7,7 +7,7 @@ import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +18,10 @@ from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from tslam_bench.baselines.interface import check_observation, episode_generators
 from tslam_bench.baselines.network import NETWORKS, policy_arguments
 from tslam_bench.baselines.registry import BaselineSpec
+from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import JOINT_LIMITS
-
-MODEL_FILE: Final = "model.zip"
-"""stable-baselines3's archive of a finished model. ``PPO.load`` runs code in it; :func:`read_policy` does not."""
-METADATA_FILE: Final = "model.json"
-"""Written last: a model directory without it is unfinished."""
 
 
 def build_policy(metadata: Mapping[str, Any]) -> MultiInputActorCriticPolicy:

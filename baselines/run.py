@@ -19,11 +19,12 @@ import tyro
 from tqdm import tqdm
 
 from tslam_bench.baselines.jobs import Job, JobRunner
-from tslam_bench.baselines.learned import METADATA_FILE
 from tslam_bench.baselines.registry import get_baseline, list_baselines
-from tslam_bench.baselines.training_config import PAPER_STEPS
+from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import BenchmarkError, InvalidInputError
+from tslam_bench.leaderboard.submission import INFO_FILE
+from tslam_bench.reconstruction.registry import get_reconstructor
 
 ALL_BASELINES: Final = tuple(spec.id for spec in list_baselines())
 
@@ -171,76 +172,109 @@ def settings_of(arguments: Arguments) -> RunSettings:
     settings = replace(PRESETS[chosen[0]], **changes)
     for baseline in settings.baselines:
         get_baseline(baseline)
-    return settings
+    for reconstructor in settings.reconstructors:
+        get_reconstructor(reconstructor)
+    unique = {name: tuple(dict.fromkeys(getattr(settings, name))) for name in ("baselines", "reconstructors", "seeds")}
+    return replace(settings, **unique)  # type: ignore[arg-type]
+
+
+Command = tuple[str, ...]
 
 
 def plan(settings: RunSettings, output: Path, workers: int) -> list[Job]:
-    """The run's commands, in an order in which one process could run them."""
-    from tslam_bench.reconstruction.registry import get_reconstructor
+    """The run's commands, in an order in which one process could run them.
 
-    specs = [get_baseline(name) for name in dict.fromkeys(settings.baselines)]
-    reconstructors = [get_reconstructor(name) for name in dict.fromkeys(settings.reconstructors)]
-    objects = ("--objects", *settings.objects) if settings.objects else ()
-    several = ("--workers", str(workers))
-    prepare = ("tslam-bench", "assets", "prepare")
-    test_objects = ("--quick",) if settings.objects == QUICK_OBJECTS else objects
-    # These look into the cache, which others change too: they always run, and take seconds if all is there.
-    jobs = [
+    Raises:
+        InvalidInputError: unknown baseline or reconstructor.
+    """
+    evaluations = _evaluations(settings, output)
+    return [
+        *_asset_jobs(settings, workers),
+        *_training_jobs(settings, output),
+        *evaluations,
+        *_scoring_jobs(settings, output, evaluations),
+    ]
+
+
+def _objects(settings: RunSettings) -> Command:
+    return ("--objects", *settings.objects) if settings.objects else ()
+
+
+def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
+    """These look into the cache, which others change too: they always run, and take seconds if all is there."""
+    prepare: Command = ("tslam-bench", "assets", "prepare")
+    several: Command = ("--workers", str(workers))
+    test_objects = ("--quick",) if settings.objects == QUICK_OBJECTS else _objects(settings)
+    return [
         Job("assets-test", (*prepare, *test_objects, *several), slots=workers, always=True),
         Job("assets-hand", (*prepare, "--hand"), always=True),
         Job("assets-train", (*prepare, *settings.train_objects, *several), slots=workers, always=True),
     ]
-    before_train = ("assets-train",)
 
-    models: dict[str, Path] = {}
-    for reconstructor in reconstructors:
-        if reconstructor.needs != "model":
-            continue
-        model = output / "models" / f"{reconstructor.id}.pt"
-        models[reconstructor.id] = model
-        command = ("tslam-bench", "reconstruct", "train", "--architecture", reconstructor.id)
-        arguments = (*settings.reconstruction_training, "--output", str(model))
-        jobs.append(Job(f"train-{reconstructor.id}", (*command, *arguments), before_train, (model,)))
-    for spec in specs:
-        if spec.kind == "learned":
-            folder = output / "models" / spec.id
-            command = ("tslam-bench", "baselines", "train", spec.id, "--steps", str(settings.steps))
-            arguments = (*settings.training, "--output", str(folder))
-            after = (*before_train, "assets-hand")
-            jobs.append(Job(f"train-{spec.id}", (*command, *arguments), after, (folder / METADATA_FILE,)))
 
-    submissions: list[tuple[str, Path]] = []
-    for spec in specs:
-        # Whatever completes nothing to nothing need not be run for `nothing`; the mean shape is its floor.
-        ids = ("grid", "mean_shape") if spec.id == "nothing" else tuple(r.id for r in reconstructors)
-        chosen = [f"{name}={models[name]}" if name in models else name for name in ids]
-        folders = [output / "submissions" / f"{spec.id}-{name}" for name in ids]
-        command = ("tslam-bench", "baselines", "evaluate", spec.id, "--object-set", settings.object_set, *objects)
-        seeds = ("--seeds", *map(str, settings.seeds))
-        arguments = (*seeds, "--reconstructors", *chosen, "--output", str(output))
-        after = ["assets-test", *(f"train-{name}" for name in ids if name in models)]
-        if spec.id == "nothing":
-            after.append("assets-train")
-        if spec.kind != "reference":
-            after.append("assets-hand")
-        if spec.kind == "learned":
-            arguments += ("--model", str(output / "models" / spec.id))
-            budget = f"{settings.name}: {settings.steps:,} steps"
-            arguments += ("--label", budget + (f", {settings.remark}" if settings.remark else ""))
-            after.append(f"train-{spec.id}")
-        outputs = tuple(folder / "submission.json" for folder in folders)
-        jobs.append(Job(f"evaluate-{spec.id}", (*command, *arguments), tuple(after), outputs))
-        submissions += [(spec.id, folder) for folder in folders]
+def _models(settings: RunSettings, output: Path) -> dict[str, Path]:
+    """Learned reconstructor -> its checkpoint."""
+    return {
+        name: output / "models" / f"{name}.pt"
+        for name in settings.reconstructors
+        if get_reconstructor(name).needs == "model"
+    }
 
-    scores = output / "scores"
-    for spec_id, folder in submissions:
-        score = scores / f"{folder.name}.json"
-        command = ("tslam-bench", "score", str(folder), *objects, "--output", str(score))
-        jobs.append(Job(f"score-{folder.name}", command, (f"evaluate-{spec_id}",), (score,)))
-    page = (output / "leaderboard.json", output / "index.html")
-    command = ("tslam-bench", "leaderboard", "--scores", str(scores), "--output", str(output))
-    jobs.append(Job("leaderboard", command, tuple(f"score-{folder.name}" for _, folder in submissions), page))
+
+def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
+    jobs = []
+    for name, model in _models(settings, output).items():
+        command: Command = ("tslam-bench", "reconstruct", "train", "--architecture", name)
+        command += (*settings.reconstruction_training, "--output", str(model))
+        jobs.append(Job(f"train-{name}", command, ("assets-train",), (model,)))
+    for name in settings.baselines:
+        if get_baseline(name).kind == "learned":
+            folder = output / "models" / name
+            command = ("tslam-bench", "baselines", "train", name, "--steps", str(settings.steps))
+            command += (*settings.training, "--output", str(folder))
+            jobs.append(Job(f"train-{name}", command, ("assets-train", "assets-hand"), (folder / METADATA_FILE,)))
     return jobs
+
+
+def _reconstructors(settings: RunSettings, baseline: str) -> Command:
+    """Most complete nothing to nothing: ``nothing`` is left with one of them, and with the mean shape as its floor."""
+    return ("grid", "mean_shape") if baseline == "nothing" else settings.reconstructors
+
+
+def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
+    models = _models(settings, output)
+    jobs = []
+    for name in settings.baselines:
+        kind = get_baseline(name).kind
+        chosen = _reconstructors(settings, name)
+        specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
+        command: Command = ("tslam-bench", "baselines", "evaluate", name, "--object-set", settings.object_set)
+        command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
+        command += ("--reconstructors", *specifications, "--output", str(output))
+        after = ["assets-test", *(f"train-{r}" for r in chosen if r in models)]
+        if any(get_reconstructor(r).needs == "objects" for r in chosen):
+            after.append("assets-train")
+        if kind != "reference":
+            after.append("assets-hand")
+        if kind == "learned":
+            label = f"{settings.name}: {settings.steps:,} steps" + (f", {settings.remark}" if settings.remark else "")
+            command += ("--model", str(output / "models" / name), "--label", label)
+            after.append(f"train-{name}")
+        outputs = tuple(output / "submissions" / f"{name}-{r}" / INFO_FILE for r in chosen)
+        jobs.append(Job(f"evaluate-{name}", command, tuple(after), outputs))
+    return jobs
+
+
+def _scoring_jobs(settings: RunSettings, output: Path, evaluations: Sequence[Job]) -> list[Job]:
+    jobs = []
+    for evaluation in evaluations:
+        for submission in (path.parent for path in evaluation.outputs):
+            score = output / "scores" / f"{submission.name}.json"
+            command = ("tslam-bench", "score", str(submission), *_objects(settings), "--output", str(score))
+            jobs.append(Job(f"score-{submission.name}", command, (evaluation.name,), (score,)))
+    page = (output / "leaderboard.json", output / "index.html")
+    command = ("tslam-bench", "leaderboard", "--scores", str(output / "scores"), "--output", str(output))
+    return [*jobs, Job("leaderboard", command, tuple(job.name for job in jobs), page)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

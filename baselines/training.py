@@ -28,10 +28,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import tslam_bench
-from tslam_bench.baselines.learned import METADATA_FILE, MODEL_FILE
 from tslam_bench.baselines.network import NETWORKS, policy_arguments
 from tslam_bench.baselines.registry import get_baseline
-from tslam_bench.baselines.training_config import PAPER_STEPS, TrainingConfig
+from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE, PAPER_STEPS, TrainingConfig
 from tslam_bench.baselines.vector import TactileVecEnv
 from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import InvalidInputError

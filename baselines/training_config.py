@@ -15,6 +15,10 @@ PAPER_STEPS: Final = 10_000_000
 """Training budget of the paper, in environment steps."""
 
 
+MODEL_FILE: Final = "model.zip"
+"""stable-baselines3's archive of a finished model. ``PPO.load`` runs code in it; our own reader does not."""
+METADATA_FILE: Final = "model.json"
+"""Written last: a model directory without it is unfinished."""
 NetworkName = Literal["small", "paper"]
 
 

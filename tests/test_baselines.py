@@ -12,9 +12,10 @@ import torch
 
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.baselines.interface import Baseline, episode_generators
-from tslam_bench.baselines.learned import METADATA_FILE, LearnedBaseline, build_policy
+from tslam_bench.baselines.learned import LearnedBaseline, build_policy
 from tslam_bench.baselines.random_actions import RandomBaseline
 from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
+from tslam_bench.baselines.training_config import METADATA_FILE
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH

@@ -17,10 +17,10 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tslam_bench.baselines import training
-from tslam_bench.baselines.learned import MODEL_FILE, read_policy
+from tslam_bench.baselines.learned import read_policy
 from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.training import train
-from tslam_bench.baselines.training_config import TrainingConfig
+from tslam_bench.baselines.training_config import MODEL_FILE, TrainingConfig
 from tslam_bench.baselines.vector import TactileVecEnv
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import CACHE_VARIABLE

@@ -41,7 +41,7 @@ _CLOSED_HAND: Final = {
 
 @dataclass(frozen=True)
 class GraspConfig:
-    """Numbers of the heuristic.
+    """Numbers of the heuristic, chosen by touched voxels on eight training objects.
 
     Attributes:
         side, forward: half range of the spots, ARTx and ARTz (m).
@@ -63,11 +63,11 @@ class GraspConfig:
     depth: tuple[float, float] = (-0.08, 0.0)
     rise: float = 0.05
     travel_height: float = 0.15
-    travel_steps: int = 20
+    travel_steps: int = 12
     sink_steps: int = 30
     close_steps: int = 14
     open_steps: int = 6
-    stall: float = 1.5e-3
+    stall: float = 3e-3
     grasps: int = 32
 
 

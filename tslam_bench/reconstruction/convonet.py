@@ -30,6 +30,8 @@ class ConvONetConfig:
     """Hidden layers of the point-wise decoder."""
     normalization: Literal["batch", "group"] = "group"
     """Normalisation after each convolution."""
+    resolutions: tuple[int, ...] = (32, 64)
+    """Lattices of the reconstruction, from coarse to fine."""
 
 
 SMALL: Final = ConvONetConfig()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -152,17 +152,20 @@ class LearnedReconstructor:
     The volume's 0.5 level is the network's ``threshold`` level: the difference of their logits is taken off. (Where a
     network is unsure, the level that gives the best IoU lies below 0.5.)
 
-    The network is evaluated on a 32^3 lattice first, then twice as fine wherever the coarse values in the 3^3
-    neighbourhood leave the 0.5 level in reach (between 0.25 and 0.75, or on both sides); elsewhere the fine values are
-    the coarse ones, interpolated. Nothing touched: empty, whatever was visited, since no training example is without a
-    touch and the network's guess there would be arbitrary.
+    The network is evaluated on a coarse lattice first. On each finer one it is evaluated in cells whose parents' 3^3
+    neighbourhood leaves the 0.5 level in reach (values between 0.25 and 0.75, or on both sides) or holds a touched
+    voxel; the other cells interpolate the coarser values.
+
+    Nothing touched: empty, whatever was visited, since no training example is without a touch and the network's guess
+    would be arbitrary.
 
     Args:
         name: registered name.
         network: network with ``encode`` and ``decode``, in evaluation mode.
         training: its training record, for the reports.
         threshold: probability at which the network's output counts as solid.
-        refine: evaluate at 64^3 near the surface; False keeps the 32^3 lattice.
+        resolutions: cells per axis of the lattices, each twice the one before; the last is the volume's. Default: the
+            network's configuration.
         batch_points: query points per pass.
         threads: torch threads.
     """
@@ -173,7 +176,7 @@ class LearnedReconstructor:
         network: torch.nn.Module,
         training: dict[str, Any] | None = None,
         threshold: float = OCCUPANCY_THRESHOLD,
-        refine: bool = True,
+        resolutions: Sequence[int] | None = None,
         batch_points: int = 8192,
         threads: int = 1,
     ) -> None:
@@ -181,7 +184,8 @@ class LearnedReconstructor:
         self.network = network
         self.training = training or {}
         self.threshold = threshold
-        self.refine = refine
+        config: Any = network.config
+        self.resolutions: tuple[int, ...] = tuple(resolutions or config.resolutions)
         self.batch_points = batch_points
         self.threads = threads
 
@@ -193,16 +197,13 @@ class LearnedReconstructor:
         grids = torch.from_numpy(np.stack([touched, visited])[None].astype(np.float32))
         with torch_threads(self.threads), torch.inference_mode():
             features = self.network.encode(grids)  # type: ignore[operator]
-            coarse = self._query(features, voxel_centres(GRID_SIZE).reshape(-1, 3)).reshape((GRID_SIZE,) * 3)
-            if not self.refine:
-                return Volume(coarse, "linear")
-            fine = zoom(coarse, 2, order=1, mode="nearest", grid_mode=True)
-            near = (maximum_filter(coarse, 3) > OCCUPANCY_THRESHOLD / 2) & (
-                minimum_filter(coarse, 3) < 1 - OCCUPANCY_THRESHOLD / 2
-            )
-            near = near.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
-            fine[near] = self._query(features, voxel_centres(2 * GRID_SIZE)[near])
-        return Volume(np.clip(fine, 0, 1), "linear")
+            size = self.resolutions[0]
+            probability = self._query(features, voxel_centres(size).reshape(-1, 3)).reshape((size,) * 3)
+            for size in self.resolutions[1:]:
+                wanted = _twice(_level_in_reach(probability) | maximum_filter(_holds_touch(touched, size // 2), 3))
+                probability = zoom(probability, 2, order=1, mode="nearest", grid_mode=True)
+                probability[wanted] = self._query(features, voxel_centres(size)[wanted])
+        return Volume(np.clip(probability, 0, 1), "linear")
 
     def _query(self, features: list[torch.Tensor], points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Probabilities (M,) at points (M, 3)."""
@@ -212,6 +213,23 @@ class LearnedReconstructor:
             return np.zeros(0, dtype=np.float32)
         offset = float(np.log(self.threshold / (1 - self.threshold)))
         return torch.sigmoid(torch.cat(logits) - offset).numpy()
+
+
+def _level_in_reach(probability: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Cells whose 3^3 neighbourhood has values above 0.25 and values below 0.75."""
+    high, low = maximum_filter(probability, 3), minimum_filter(probability, 3)
+    return np.asarray((high > OCCUPANCY_THRESHOLD / 2) & (low < 1 - OCCUPANCY_THRESHOLD / 2))
+
+
+def _holds_touch(touched: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    """Cells of a size^3 lattice, no finer than the grid, that hold a touched voxel."""
+    blocks = GRID_SIZE // size
+    return np.asarray(touched.reshape(size, blocks, size, blocks, size, blocks).any(axis=(1, 3, 5)))
+
+
+def _twice(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Every cell as its 2^3 children."""
+    return cells.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
 
 
 def load_reconstructor(path: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:

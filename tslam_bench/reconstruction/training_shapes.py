@@ -37,7 +37,8 @@ class TrainingShape:
         surface_points, surface_normals: (20000, 3) area-uniform samples and their outward face normals.
         box_points, box_inside: (20000, 3) uniform in the bounding box, and whether each is in the solid.
         near_points, near_inside: (2, 10000, 3) and (2, 10000): surface points with normal noise, one row per sigma.
-        lookup: (nx, ny, nz) bool, solid at samples ``LOOKUP_SPACING`` apart from ``-half_extents`` on.
+        lookup: (nx, ny, nz) bool, solid at samples ``LOOKUP_SPACING`` apart; sample [1, 1, 1] is at ``-half_extents``, and
+            the outermost samples are empty.
     """
 
     name: str
@@ -53,10 +54,9 @@ class TrainingShape:
 
     def inside(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether ``points`` (..., 3) in the shape's frame are in the solid, to the nearest sample of the lookup."""
-        index = np.rint((points + self.half_extents) / LOOKUP_SPACING).astype(np.int64)
-        within = np.asarray(((index >= 0) & (index < self.lookup.shape)).all(axis=-1))
-        index = np.where(within[..., None], index, 0)
-        return within & self.lookup[index[..., 0], index[..., 1], index[..., 2]]
+        index = np.rint((points + self.half_extents) / LOOKUP_SPACING).astype(np.int64) + 1
+        index = np.clip(index, 0, np.array(self.lookup.shape) - 1)  # the rim of the lookup is empty
+        return np.asarray(self.lookup[index[..., 0], index[..., 1], index[..., 2]])
 
 
 def winding_inside(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray[np.bool_]:
@@ -112,6 +112,7 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
     box_points = half_extents * generator.uniform(-1, 1, (BOX_POINTS, 3))
     axes = [np.arange(-h, h + LOOKUP_SPACING, LOOKUP_SPACING) for h in half_extents]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    lookup = winding_inside(vertices, faces, lattice.reshape(-1, 3)).reshape(lattice.shape[:3])
     return TrainingShape(
         name=name,
         half_extents=half_extents,
@@ -122,7 +123,7 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
         box_inside=winding_inside(vertices, faces, box_points),
         near_points=near_points,
         near_inside=winding_inside(vertices, faces, near_points.reshape(-1, 3)).reshape(near_points.shape[:2]),
-        lookup=winding_inside(vertices, faces, lattice.reshape(-1, 3)).reshape(lattice.shape[:3]),
+        lookup=np.pad(lookup, 1),
     )
 
 

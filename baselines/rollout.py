@@ -116,7 +116,6 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         if bool(terminated) or bool(truncated) != (step == HORIZON - 1):
             raise InvalidInputError(f"environment: the episode ended after {step + 1} steps, expected {HORIZON}")
     base = env.unwrapped
-    touched_step = to_numpy(base.touched_step)[0].astype(np.int16)  # type: ignore[attr-defined]
     return Rollout(
         object_name,
         pose,
@@ -124,6 +123,6 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         actions,
         to_numpy(base.touched)[0].astype(bool),  # type: ignore[attr-defined]
         to_numpy(base.visited)[0].astype(bool),  # type: ignore[attr-defined]
-        touched_step,
+        to_numpy(base.touched_step)[0].astype(np.int16),  # type: ignore[attr-defined]
         episode_return,
     )

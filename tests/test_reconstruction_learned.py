@@ -342,7 +342,7 @@ def test_learning_rate_rises_and_falls_to_zero():
 @pytest.mark.parametrize("wrong", [{"steps": 0}, {"learning_rate": -1.0}, {"scale_range": (1.2, 0.8)}, {"points": -3}])
 def test_bad_configurations_are_refused(wrong):
     with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-        TrainingConfig(**wrong)
+        TrainingConfig(**wrong).check()
 
 
 # --- Checkpoints ---------------------------------------------------------------------------------------------------

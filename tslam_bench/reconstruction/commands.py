@@ -112,11 +112,14 @@ def _list(arguments: list[str]) -> None:
 def _train(arguments: list[str]) -> None:
     from tqdm import tqdm
 
+    from tslam_bench.reconstruction.learned import network_config
     from tslam_bench.reconstruction.training import train
     from tslam_bench.reconstruction.training_objects import load_training_shapes, training_names
 
     parsed = tyro.cli(TrainArguments, args=arguments, prog="tslam-bench reconstruct train")
     config = parsed.config
+    config.check()
+    network_config(config.architecture, config.size)
     names = training_names(parsed.split, parsed.count)
     try:
         held_out = training_names(parsed.threshold_split)

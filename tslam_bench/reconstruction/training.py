@@ -102,9 +102,10 @@ def train(
         The trained reconstructor, or None if ``stop`` ended the run.
 
     Raises:
-        InvalidInputError: no shapes; or ``output`` or its progress file is of another training run.
+        InvalidInputError: no shapes; a value of ``config`` out of range; or ``output`` or its progress file is of another training run.
         AssetError: the output folder cannot be written.
     """
+    config.check()
     if not shapes:
         raise InvalidInputError("training shapes: none; prepare some with `tslam-bench assets prepare --split train`")
     output = Path(output)

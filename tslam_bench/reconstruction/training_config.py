@@ -37,7 +37,8 @@ class TrainingConfig:
     save_every: int = 50
     """Steps between the checkpoints that a killed run resumes from."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises InvalidInputError if a value is out of range. (Not at construction: tyro would catch it.)"""
         for name in ("steps", "batch_size", "points", "threads", "threshold_examples", "save_every"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: choose at least 1")

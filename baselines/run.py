@@ -26,6 +26,8 @@ from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.leaderboard.submission import INFO_FILE
 from tslam_bench.reconstruction.registry import get_reconstructor
 
+_TEST_ASSETS: Final = "assets-test"
+"""Job that prepares the test objects and the hand."""
 ALL_BASELINES: Final = tuple(spec.id for spec in list_baselines())
 
 
@@ -41,7 +43,8 @@ class RunSettings:
         seeds: repetitions of every episode.
         steps: training steps of each learned baseline.
         training: further arguments of ``tslam-bench baselines train``.
-        train_objects: arguments of ``tslam-bench assets prepare`` for the train split.
+        learning_objects: (split, arguments of ``tslam-bench assets prepare``) of the objects to learn from; the
+            reconstructors' thresholds are fixed on val, or on train while there is none.
         reconstructors: ids; learned ones are trained first.
         reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
         remark: shown beside the figures of learned baselines.
@@ -54,7 +57,7 @@ class RunSettings:
     seeds: tuple[int, ...]
     steps: int
     training: tuple[str, ...]
-    train_objects: tuple[str, ...]
+    learning_objects: tuple[tuple[str, tuple[str, ...]], ...]
     reconstructors: tuple[str, ...]
     reconstruction_training: tuple[str, ...]
     remark: str
@@ -64,6 +67,7 @@ _SMALL_TRAINING: Final = (
     *("--network", "small", "--num-envs", "4", "--rollout-steps", "200", "--batch-size", "200", "--epochs", "4"),
     *("--checkpoint-every", "1600"),
 )
+_GENERATED: Final = ("--source", "generated", "--count")
 PRESETS: Final[dict[str, RunSettings]] = {
     "quick": RunSettings(
         name="quick",
@@ -73,7 +77,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         seeds=(0,),
         steps=4000,
         training=_SMALL_TRAINING,
-        train_objects=("--split", "train", "--source", "generated", "--count", "24"),
+        learning_objects=(("train", (*_GENERATED, "24")), ("val", (*_GENERATED, "6"))),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "300"),
         remark="proves the path, not the method",
@@ -97,7 +101,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
             "--epochs",
             "1",
         ),
-        train_objects=("--split", "train", "--source", "generated", "--count", "2"),
+        learning_objects=(("train", (*_GENERATED, "2")),),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
         remark="shows that everything runs, nothing else",
@@ -110,7 +114,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         seeds=(0, 1, 2),
         steps=PAPER_STEPS,
         training=("--network", "paper", "--num-envs", "16"),
-        train_objects=("--split", "train"),
+        learning_objects=(("train", ()), ("val", ())),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "20000", "--batch-size", "16", "--points", "2048"),
         remark="",
@@ -192,7 +196,7 @@ def plan(settings: RunSettings, output: Path, workers: int) -> list[Job]:
         *_asset_jobs(settings, workers),
         *_training_jobs(settings, output),
         *evaluations,
-        *_scoring_jobs(settings, output, evaluations),
+        *_scoring_jobs(settings, output, evaluations, workers),
     ]
 
 
@@ -205,11 +209,16 @@ def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
     prepare: Command = ("tslam-bench", "assets", "prepare")
     several: Command = ("--workers", str(workers))
     test_objects = ("--quick",) if settings.objects == QUICK_OBJECTS else _objects(settings)
-    return [
-        Job("assets-test", (*prepare, *test_objects, *several), slots=workers, always=True),
-        Job("assets-hand", (*prepare, "--hand"), always=True),
-        Job("assets-train", (*prepare, *settings.train_objects, *several), slots=workers, always=True),
-    ]
+    jobs = [Job(_TEST_ASSETS, (*prepare, *test_objects, *several), slots=workers, always=True)]
+    for split, arguments in settings.learning_objects:
+        command = (*prepare, "--split", split, *arguments, *several)
+        jobs.append(Job(f"assets-{split}", command, slots=workers, always=True))
+    return jobs
+
+
+def _learning_assets(settings: RunSettings) -> tuple[str, ...]:
+    """Names of the jobs that prepare what is learned from."""
+    return tuple(f"assets-{split}" for split, _ in settings.learning_objects)
 
 
 def _models(settings: RunSettings, output: Path) -> dict[str, Path]:
@@ -226,13 +235,13 @@ def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
     for name, model in _models(settings, output).items():
         command: Command = ("tslam-bench", "reconstruct", "train", "--architecture", name)
         command += (*settings.reconstruction_training, "--output", str(model))
-        jobs.append(Job(f"train-{name}", command, ("assets-train",), (model,)))
+        jobs.append(Job(f"train-{name}", command, _learning_assets(settings), (model,)))
     for name in settings.baselines:
         if get_baseline(name).kind == "learned":
             folder = output / "models" / name
             command = ("tslam-bench", "baselines", "train", name, "--steps", str(settings.steps))
             command += (*settings.training, "--output", str(folder))
-            jobs.append(Job(f"train-{name}", command, ("assets-train", "assets-hand"), (folder / METADATA_FILE,)))
+            jobs.append(Job(f"train-{name}", command, (_TEST_ASSETS, "assets-train"), (folder / METADATA_FILE,)))
     return jobs
 
 
@@ -251,11 +260,9 @@ def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
         command: Command = ("tslam-bench", "baselines", "evaluate", name, "--object-set", settings.object_set)
         command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
         command += ("--reconstructors", *specifications, "--output", str(output))
-        after = ["assets-test", *(f"train-{r}" for r in chosen if r in models)]
+        after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
         if any(get_reconstructor(r).needs == "objects" for r in chosen):
             after.append("assets-train")
-        if kind != "reference":
-            after.append("assets-hand")
         if kind == "learned":
             label = f"{settings.name}: {settings.steps:,} steps" + (f", {settings.remark}" if settings.remark else "")
             command += ("--model", str(output / "models" / name), "--label", label)
@@ -265,16 +272,19 @@ def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
     return jobs
 
 
-def _scoring_jobs(settings: RunSettings, output: Path, evaluations: Sequence[Job]) -> list[Job]:
+def _scoring_jobs(settings: RunSettings, output: Path, evaluations: Sequence[Job], workers: int) -> list[Job]:
     jobs = []
+    folder = output / "scores"
     for evaluation in evaluations:
-        for submission in (path.parent for path in evaluation.outputs):
-            score = output / "scores" / f"{submission.name}.json"
-            command = ("tslam-bench", "score", str(submission), *_objects(settings), "--output", str(score))
-            jobs.append(Job(f"score-{submission.name}", command, (evaluation.name,), (score,)))
+        submissions = [path.parent for path in evaluation.outputs]
+        files = tuple(folder / f"{submission.name}.json" for submission in submissions)
+        command: Command = ("tslam-bench", "score", *map(str, submissions), *_objects(settings))
+        command += ("--output", str(folder if len(files) > 1 else files[0]))
+        jobs.append(Job(evaluation.name.replace("evaluate", "score"), command, (evaluation.name,), files))
     page = (output / "leaderboard.json", output / "index.html")
-    command = ("tslam-bench", "leaderboard", "--scores", str(output / "scores"), "--output", str(output))
-    return [*jobs, Job("leaderboard", command, tuple(job.name for job in jobs), page)]
+    command = ("tslam-bench", "leaderboard", "--scores", str(folder), "--output", str(output))
+    command += ("--workers", str(workers))
+    return [*jobs, Job("leaderboard", command, tuple(job.name for job in jobs), page, slots=workers)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

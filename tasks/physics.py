@@ -17,11 +17,39 @@ SOLVER_POSITION_ITERATIONS: Final = 4
 SOLVER_VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET: Final = 2e-3
 REST_OFFSET: Final = 0.0
+GRAVITY: Final = (0.0, 0.0, -9.81)
+"""The hand is gravity-compensated and the object fixed, so this moves nothing yet."""
+SLEEP_THRESHOLD: Final = 0.005
+BOUNCE_THRESHOLD: Final = 2.0
 STATIC_FRICTION: Final = 1.0
 DYNAMIC_FRICTION: Final = 1.0
 RESTITUTION: Final = 0.0
 COOKING_SCALE: Final = 100.0
 """Hulls are cooked in centimetres and scaled back: PhysX's plane tolerance is 0.7 mm and eats small hulls cooked in metres."""
+
+CACHED_BODIES: Final = 64
+"""Cooked objects kept per process: cooking one takes up to a few dozen milliseconds."""
+
+
+def configure() -> None:
+    """Sets SAPIEN's global defaults for scenes, bodies and shapes that are made next: what ManiSkill sets for the task."""
+    physx.set_shape_config(contact_offset=CONTACT_OFFSET, rest_offset=REST_OFFSET)
+    physx.set_body_config(
+        solver_position_iterations=SOLVER_POSITION_ITERATIONS,
+        solver_velocity_iterations=SOLVER_VELOCITY_ITERATIONS,
+        sleep_threshold=SLEEP_THRESHOLD,
+    )
+    physx.set_scene_config(
+        gravity=np.array(GRAVITY),
+        bounce_threshold=BOUNCE_THRESHOLD,
+        enable_pcm=True,
+        enable_tgs=True,
+        enable_ccd=False,
+        enable_enhanced_determinism=False,
+        enable_friction_every_iteration=True,
+        cpu_workers=0,
+    )
+    physx.set_default_material(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
 
 
 def pose_quaternion(pose: int) -> np.ndarray:

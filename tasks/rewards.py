@@ -12,6 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from tslam_bench import grids
+from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE
 from tslam_bench.tasks.alpha_shape import alpha_shape_samples, chamfer_l2
 from tslam_bench.tasks.arrays import Backend
@@ -57,10 +59,10 @@ class Rewards:
         self._surface = SurfaceDistance(num_envs, backend) if mode == "chamfer" else None
         self._shapes = AlphaShapes(num_envs) if mode == "disagreement" else None
 
-    @property
-    def needs_surface(self) -> bool:
-        """Whether the mode is privileged: it reads the true surface (see :meth:`set_surface`)."""
-        return self._surface is not None
+    def set_object(self, env: int, prepared: PreparedObject, pose: int) -> None:
+        """Tells the privileged mode what one environment explores; the others do not look."""
+        if self._surface is not None:
+            self.set_surface(env, prepared.surface_points[:SURFACE_SUBSAMPLE] @ grids.pose_rotation(pose).T)
 
     def set_surface(self, env: int, points: np.ndarray) -> None:
         """Gives one environment its true surface, (SURFACE_SUBSAMPLE, 3) in the world frame (m)."""

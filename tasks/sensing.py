@@ -9,7 +9,7 @@ Arrays are ``(environments, ...)``; E environments, P probes, N = 32 voxels per 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -52,38 +52,70 @@ class Contacts:
 
 
 class FieldAtlas:
-    """Signed-distance fields of several objects in one flat array, so that environments with different objects share a gather."""
+    """The signed-distance fields in use, in equal slots of one flat array, so that environments share a gather.
 
-    def __init__(self, backend: Backend) -> None:
+    A field stays in its slot while an environment uses it, and after that until the slot is needed: memory is bounded
+    by the number of environments, not by the number of objects.
+
+    Args:
+        num_envs: environments.
+        backend: numpy or torch.
+    """
+
+    SPARE_SLOTS = 16
+
+    def __init__(self, num_envs: int, backend: Backend) -> None:
         self._backend = backend
-        self._index: dict[str, int] = {}
-        self._fields: list[SignedDistanceField] = []
-        self._offsets: list[int] = []
-        self._stale = True
+        self._limit = num_envs + self.SPARE_SLOTS
+        self._names: list[str | None] = []  # of the slots
+        self._fields: list[SignedDistanceField | None] = []
+        self._last_use: list[int] = []
+        self._slot_size = 0
+        self._clock = 0
         self.values: Array = None
 
-    def add(self, name: str, field: SignedDistanceField) -> int:
-        """Index of the field called ``name``, adding it on first use."""
-        if name not in self._index:
-            self._index[name] = len(self._fields)
-            self._offsets.append(sum(f.values.size for f in self._fields))
-            self._fields.append(field)
-            self._stale = True
-        return self._index[name]
+    def place(self, name: str, field: SignedDistanceField, in_use: Collection[str]) -> int:
+        """Offset into ``values`` of the field called ``name``, copying it in if it is not there.
 
-    def build(self) -> None:
-        """Joins the fields that were added since the last call."""
-        if not self._stale:
-            return
-        values = np.concatenate([f.values.reshape(-1).astype(np.float32) for f in self._fields])
-        self.values = self._backend.array(values)
-        self._stale = False
+        ``in_use`` names the fields that must stay.
+        """
+        self._clock += 1
+        if name not in self._names:
+            self._put(self._free_slot(in_use), name, field)
+        slot = self._names.index(name)
+        self._last_use[slot] = self._clock
+        return slot * self._slot_size
 
-    def parameters(self, index: int) -> tuple[int, tuple[int, int, int], np.ndarray, float]:
-        """(offset into ``values``, samples per axis, (3,) origin, spacing) of a field."""
-        field = self._fields[index]
-        nx, ny, nz = field.values.shape
-        return self._offsets[index], (nx, ny, nz), np.asarray(field.origin, dtype=np.float64), float(field.spacing)
+    def offset(self, name: str) -> int:
+        """Offset of a field that is in its slot."""
+        return self._names.index(name) * self._slot_size
+
+    def _free_slot(self, in_use: Collection[str]) -> int:
+        if len(self._names) < self._limit:
+            self._names.append(None)
+            self._fields.append(None)
+            self._last_use.append(0)
+            return len(self._names) - 1
+        idle = [slot for slot, name in enumerate(self._names) if name not in in_use]
+        return min(idle, key=lambda slot: self._last_use[slot])
+
+    def _put(self, slot: int, name: str, field: SignedDistanceField) -> None:
+        self._names[slot], self._fields[slot] = name, field
+        needed = len(self._names)
+        if self.values is None or field.values.size > self._slot_size or needed * self._slot_size > len(self.values):
+            self._slot_size = max(self._slot_size, field.values.size)
+            slots = min(self._limit, max(4, 2 * needed))
+            self.values = self._backend.zeros(slots * self._slot_size, np.float32)
+            for other, kept in enumerate(self._fields):
+                if kept is not None:
+                    self._copy(other, kept)
+        else:
+            self._copy(slot, field)
+
+    def _copy(self, slot: int, field: SignedDistanceField) -> None:
+        start = slot * self._slot_size
+        flat = np.ascontiguousarray(field.values, dtype=np.float32).reshape(-1)
+        self.values[start : start + len(flat)] = self._backend.array(flat)
 
 
 class TactileSensing:
@@ -107,7 +139,7 @@ class TactileSensing:
         link_of_probe[np.arange(len(skin.probes)), skin.probes.link] = True
         self._first_probe = np.searchsorted(skin.probes.link, np.arange(self._num_links))
         self._link_of_probe = backend.array(link_of_probe.astype(np.float32))
-        self.atlas = FieldAtlas(backend)
+        self.atlas = FieldAtlas(num_envs, backend)
 
         zeros, flat = backend.zeros, num_envs * VOXELS + 1  # the last element takes what lies outside W
         self._touched = zeros(flat, bool)
@@ -119,7 +151,7 @@ class TactileSensing:
         self._env_row = backend.array(np.arange(num_envs, dtype=np.int64)[:, None])
 
         # Per environment, of its object and pose; host copies, pushed to the device after a reset.
-        self._field_of_env = np.zeros(num_envs, dtype=np.int64)
+        self._objects: list[tuple[str, SignedDistanceField] | None] = [None] * num_envs
         self._turn_host = np.tile(np.eye(3, dtype=np.float32), (num_envs, 1, 1))
         self._bound = False
 
@@ -147,7 +179,7 @@ class TactileSensing:
     # -- episodes ---------------------------------------------------------------------------------------------
     def set_object(self, env: int, name: str, field: SignedDistanceField, pose: int) -> None:
         """Puts an object in a pose into one environment; call :meth:`begin` before the next step."""
-        self._field_of_env[env] = self.atlas.add(name, field)
+        self._objects[env] = (name, field)
         self._turn_host[env] = grids.pose_rotation(pose)
         self._bound = False
 
@@ -161,10 +193,17 @@ class TactileSensing:
         self._on[list(envs)] = False
 
     def _bind(self) -> None:
-        self.atlas.build()
-        parameters = [self.atlas.parameters(int(i)) for i in self._field_of_env]
+        objects = [entry for entry in self._objects if entry is not None]
+        if len(objects) < self.num_envs:
+            raise ValueError("set_object has to be called for every environment before begin")
+        in_use = {name for name, _ in objects}
+        for name, field in objects:
+            self.atlas.place(name, field, in_use)
         array = self.backend.array
-        offsets, sizes, origins, spacings = zip(*parameters, strict=True)
+        offsets = [self.atlas.offset(name) for name, _ in objects]  # read last: placing can move the slots
+        sizes = [field.values.shape for _, field in objects]
+        origins = [np.asarray(field.origin, dtype=np.float64) for _, field in objects]
+        spacings = [float(field.spacing) for _, field in objects]
         strides = [(ny * nz, nz, 1) for _, ny, nz in sizes]
         self._offset = array(np.array(offsets, dtype=np.int64)[:, None])
         self._stride = [array(np.array([s[a] for s in strides], dtype=np.int64)[:, None]) for a in range(3)]

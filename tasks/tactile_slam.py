@@ -21,14 +21,13 @@ from sapien import physx
 
 from tslam_bench import grids
 from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import PreparedObject, list_objects, load_object
+from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import (
     CONTROL_STEP_SECONDS,
     ENVIRONMENT_ID,
     GRID_SIZE,
     HORIZON,
     NUM_JOINTS,
-    NUM_POSES,
     PHYSICS_FREQUENCY,
     REWARD_MODES,
     SUBSTEPS,
@@ -36,24 +35,17 @@ from tslam_bench.constants import (
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import (
     CONTROL_MODES,
-    JOINT_LIMITS,
     JOINT_NAMES,
     SKIN_LINKS,
-    START_ARM_HIGH,
-    START_ARM_LOW,
-    START_CLEARANCE,
-    START_FINGER_NOISE,
 )
 from tslam_bench.tasks import physics
 from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
 from tslam_bench.tasks.hand_agent import AdroitHand
 from tslam_bench.tasks.rendering import vulkan_device_available
-from tslam_bench.tasks.rewards import SURFACE_SUBSAMPLE, Rewards
+from tslam_bench.tasks.rewards import Rewards
 from tslam_bench.tasks.sensing import Contacts, TactileSensing
 from tslam_bench.tasks.skin import build_skin
-
-_HEIGHT = JOINT_NAMES.index("ARTy")
-_OPEN_QPOS = np.clip(0.0, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+from tslam_bench.tasks.starts import StartSampler
 
 
 class TactileSLAMEnv(BaseEnv):
@@ -133,19 +125,8 @@ class TactileSLAMEnv(BaseEnv):
                 f"num_envs {num_envs}, sim_backend {kwargs.get('sim_backend', 'auto')!r}: batched simulation needs a GPU and "
                 "there is none (CUDA); make environments with num_envs=1 instead"
             )
-        if object is not None and objects is not None:
-            raise InvalidInputError("object and objects: give one or the other, not both")
+        self._starts = StartSampler(object, objects, split, pose)
         self.split = split
-        self._pose = None if pose is None else grids.check_pose(pose)
-        self._prepared: dict[str, PreparedObject] = {}
-        names = [object] if object is not None else list(objects) if objects is not None else None
-        if names is None:
-            names = [record["name"] for record in list_objects(split)]
-        if not names:
-            raise InvalidInputError(
-                f"split {split!r}: no prepared objects; run 'tslam-bench assets prepare --split {split}'"
-            )
-        self._object_names = tuple(self._load(name).name for name in names) if len(names) == 1 else tuple(names)
         self.object_name: list[str] = [""] * num_envs
         self.pose: list[int] = [0] * num_envs
         self._bodies: dict[str, sapien.Entity] = {}
@@ -173,7 +154,9 @@ class TactileSLAMEnv(BaseEnv):
             sim_freq=SUBSTEPS * (PHYSICS_FREQUENCY // SUBSTEPS),
             control_freq=PHYSICS_FREQUENCY // SUBSTEPS,
             scene_config=SceneConfig(
-                gravity=np.array([0.0, 0.0, -9.81]),
+                gravity=np.array(physics.GRAVITY),
+                bounce_threshold=physics.BOUNCE_THRESHOLD,
+                sleep_threshold=physics.SLEEP_THRESHOLD,
                 contact_offset=physics.CONTACT_OFFSET,
                 rest_offset=physics.REST_OFFSET,
                 solver_position_iterations=physics.SOLVER_POSITION_ITERATIONS,
@@ -238,8 +221,8 @@ class TactileSLAMEnv(BaseEnv):
         """One body per sub-scene, fixed until the next reconfigure: a GPU scene cannot gain bodies. Not run on a GPU yet."""
         entities = []
         for env in range(self.num_envs):
-            name = self._draw_object(env, options)
-            prepared = self._load(name)
+            name = options["object"][env] if "object" in options else None
+            prepared = self._starts.draw_object(self._batched_episode_rng[env], name)
             shapes = physics.collision_shapes(prepared)
             entity = physics.object_entity(prepared, f"scene-{env}_object", shapes, self.scene.can_render())
             entity.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(0))
@@ -267,61 +250,32 @@ class TactileSLAMEnv(BaseEnv):
                     f"options[{key!r}]: {len(options[key])} values for {self.num_envs} environments; give one each"
                 )
         for name in options.get("object", ()):
-            self._load(name)
+            self._starts.load(name)
         for pose in options.get("pose", ()):
             grids.check_pose(pose)
         return super().reset(seed=seed, options=options)
-
-    def _load(self, name: str) -> PreparedObject:
-        if name not in self._prepared:
-            prepared = load_object(name, self.split)
-            self._prepared[name] = self._prepared[prepared.name] = prepared
-        return self._prepared[name]
-
-    def _draw_object(self, env: int, options: dict) -> str:
-        draw = self._batched_episode_rng[
-            env
-        ].uniform()  # drawn even if not used: the start does not depend on the choice
-        return (
-            options["object"][env] if "object" in options else self._object_names[int(draw * len(self._object_names))]
-        )
-
-    def _draw_pose(self, env: int, options: dict) -> int:
-        draw = int(self._batched_episode_rng[env].uniform() * NUM_POSES)
-        if "pose" in options:
-            return grids.check_pose(options["pose"][env])
-        return draw if self._pose is None else self._pose
-
-    def _draw_start(self, env: int) -> np.ndarray:
-        """(28,) float32 start of the hand: arm uniform in its box above the object, wrist and fingers open plus noise."""
-        uniform = self._batched_episode_rng[env].uniform(size=NUM_JOINTS)
-        start = _OPEN_QPOS + START_FINGER_NOISE * (2 * uniform - 1)
-        low, high = np.array(START_ARM_LOW), np.array(START_ARM_HIGH)
-        top = self._load(self.object_name[env]).vertices[:, 2]  # poses turn about z or half-turn: |z| extents stay
-        low[_HEIGHT] = max(low[_HEIGHT], (-top.min() if self.pose[env] >= 4 else top.max()) + START_CLEARANCE)
-        start[: len(low)] = low + (high - low) * uniform[: len(low)]
-        return np.clip(start, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1]).astype(np.float32)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         envs = env_idx.tolist()
         starts = []
         for env in envs:
-            name = self._draw_object(env, options)
-            if not self.gpu_sim_enabled:
-                self.object_name[env] = self._load(name).name
-            self.pose[env] = self._draw_pose(env, options)
-            starts.append(self._draw_start(env))
-            prepared = self._load(self.object_name[env])
-            self._sensing.set_object(env, prepared.name, prepared.field, self.pose[env])
-            if self._rewards is not None and self._rewards.needs_surface:
-                surface = prepared.surface_points[:SURFACE_SUBSAMPLE] @ grids.pose_rotation(self.pose[env]).T
-                self._rewards.set_surface(env, surface)
+            rng = self._batched_episode_rng[env]
+            name = options["object"][env] if "object" in options else None
+            prepared = self._starts.draw_object(rng, name)
+            if self.gpu_sim_enabled:  # bodies are fixed until the next reconfigure
+                prepared = self._starts.load(self.object_name[env])
+            start = self._starts.draw(rng, pose=options["pose"][env] if "pose" in options else None, prepared=prepared)
+            starts.append(start)
+            self.object_name[env], self.pose[env] = prepared.name, start.pose
+            self._sensing.set_object(env, prepared.name, prepared.field, start.pose)
+            if self._rewards is not None:
+                self._rewards.set_object(env, prepared, start.pose)
         order = np.argsort(self.agent.joint_order)  # from JOINT_NAMES to the simulator's order
-        qpos = np.stack(starts)[:, order]
+        qpos = np.stack([start.qpos for start in starts])[:, order]
         if self.gpu_sim_enabled:
             self._place_gpu_objects(env_idx, qpos)
         else:
-            self._fresh_physics(self._load(self.object_name[0]), self.pose[0], qpos[0])
+            self._fresh_physics(starts[0].prepared, starts[0].pose, qpos[0])
         self._sensing.begin(envs)
         if self._rewards is not None:
             self._rewards.begin(envs)
@@ -352,6 +306,8 @@ class TactileSLAMEnv(BaseEnv):
             self._set_scene_config()
             shapes = physics.collision_shapes(prepared)
             body = physics.object_entity(prepared, "scene-0_object", shapes, self.scene.can_render())
+            while len(self._bodies) >= physics.CACHED_BODIES:
+                del self._bodies[next(iter(self._bodies))]
             self._bodies[prepared.name] = body
         entities = [e for e in old.entities if e.name != "scene-0_object"]
         for entity in list(old.entities):

@@ -14,7 +14,7 @@ from tslam_bench.assets.store import SignedDistanceField
 from tslam_bench.constants import TOUCH_DISTANCE
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
-from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, TactileSensing
+from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, FieldAtlas, TactileSensing
 from tslam_bench.tasks.skin import build_skin
 
 RADIUS, OFFSET = 0.05, np.array([0.02, -0.01, 0.015])
@@ -160,3 +160,20 @@ def test_the_device_path_covers_every_probe_and_agrees(skin):
         b = dense.step(torch.from_numpy(matrices), torch.full((2,), step))
         assert_same(a, b)
     np.testing.assert_array_equal(compact.touched, dense.touched.numpy())
+
+
+def test_fields_come_and_go_without_growing(skin):
+    """Many objects through few environments: always the field of the object at hand, in bounded memory."""
+    generator = np.random.default_rng(13)
+    sensing = TactileSensing(2, skin, NumpyBackend())
+    for episode in range(60):
+        radii = 0.03 + 0.001 * np.array([episode % 23, (7 * episode) % 19])
+        for env, radius in enumerate(radii):
+            sensing.set_object(env, f"sphere{radius:.3f}", sphere_field(radius, 3e-3), 0)
+        sensing.begin([0, 1])
+        matrices = random_links(generator, 2)
+        on = sensing.touches(matrices)
+        for env, radius in enumerate(radii):
+            alone = make(NumpyBackend(), skin, [0], [("alone", sphere_field(radius, 3e-3))])
+            np.testing.assert_array_equal(on[env], alone.touches(matrices[env : env + 1])[0])
+    assert len(sensing.atlas.values) <= (2 + FieldAtlas.SPARE_SLOTS) * sphere_field(0.053, 3e-3).values.size

@@ -6,12 +6,14 @@ Importing this package registers every environment id with Gymnasium::
     import tslam_bench
 
     env = gym.make("TactileSLAM-v0", object="mug", pose=0)
+    envs = tslam_bench.make_vec("TactileSLAM-v0", num_envs=32)
 
 The simulator is imported when an environment is made, not before: metrics and scoring do without it.
 """
 
-from tslam_bench.registration import register_environments
+from tslam_bench.registration import make_vec, register_environments
 
+__all__ = ["__version__", "make_vec"]
 __version__ = "0.1.0"
 
 register_environments()

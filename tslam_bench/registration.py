@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
+import gymnasium.vector
 
 from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.errors import InvalidInputError
 
 ENVIRONMENT_IDS = (ENVIRONMENT_ID,)
 """Every id that the package registers."""
@@ -19,6 +22,81 @@ def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     import tslam_bench.tasks.tactile_slam  # noqa: F401  (registers with ManiSkill)
 
     return registration.make(environment_id, **kwargs)
+
+
+def make_vec(
+    environment_id: str = ENVIRONMENT_ID,
+    num_envs: int = 16,
+    device: str = "auto",
+    *,
+    object: str | None = None,
+    objects: Sequence[str] | None = None,
+    split: str = "test",
+    pose: int | None = None,
+    reward_mode: str = "tslam",
+    control_mode: str = "pd_joint_delta_pos",
+    processes: int | None = None,
+) -> gymnasium.vector.VectorEnv:
+    """A Gymnasium vector environment (1.x semantics, autoreset ``SAME_STEP``) of many hands.
+
+    On the CPU: scenes in worker processes, sensed as one batch per worker, observations as numpy arrays; bit for
+    bit the episodes of ``gymnasium.make`` with the same seeds. On CUDA: ManiSkill's GPU simulation and its vector
+    wrapper, observations as torch tensors on the device. *The CUDA path has not been run on a GPU yet.*
+
+    Args:
+        environment_id: a registered id.
+        num_envs: environments.
+        device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
+        object: one object for every episode.
+        objects: names to draw from, one draw per episode; neither means the whole split.
+        split: ``test``, ``train`` or ``val``.
+        pose: 0..7 for every episode; None draws.
+        reward_mode: see the environment.
+        control_mode: see the environment.
+        processes: CPU worker processes; None means the cores.
+
+    Raises:
+        InvalidInputError: unknown id, device, object, pose or mode; CUDA asked for where there is none.
+        AssetError: objects or the hand are not prepared.
+    """
+    if environment_id not in ENVIRONMENT_IDS:
+        raise InvalidInputError(f"environment {environment_id!r}: unknown; choose one of {', '.join(ENVIRONMENT_IDS)}")
+    if device not in ("auto", "cpu", "cuda"):
+        raise InvalidInputError(f"device {device!r}: unknown; choose auto, cpu or cuda")
+    if device != "cpu" and _cuda_available():
+        return _make_cuda_vec(
+            environment_id,
+            num_envs,
+            {
+                "object": object,
+                "objects": objects,
+                "split": split,
+                "pose": pose,
+                "reward_mode": reward_mode,
+                "control_mode": control_mode,
+            },
+        )
+    if device == "cuda":
+        raise InvalidInputError("device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto")
+    from tslam_bench.tasks.batch import BatchSettings
+    from tslam_bench.tasks.vector_env import TactileVectorEnv
+
+    chosen = None if objects is None else tuple(objects)
+    return TactileVectorEnv(num_envs, BatchSettings(object, chosen, split, pose, reward_mode, control_mode), processes)
+
+
+def _cuda_available() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def _make_cuda_vec(environment_id: str, num_envs: int, kwargs: dict[str, Any]) -> gymnasium.vector.VectorEnv:
+    """Not run on a GPU yet."""
+    from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+    environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)
+    return ManiSkillVectorEnv(environment, auto_reset=True, ignore_terminations=True)
 
 
 def register_environments() -> None:

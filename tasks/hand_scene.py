@@ -1,0 +1,142 @@
+"""One hand and one object in a physics system of their own, on the CPU: bare SAPIEN, the same physics as the ManiSkill task.
+
+No torch, no ManiSkill: worker processes import this and stay small.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien import physx
+
+from tslam_bench.constants import PHYSICS_FREQUENCY, SUBSTEPS
+from tslam_bench.hand_constants import (
+    ARMATURE,
+    BASE_POSITION,
+    BASE_QUATERNION,
+    DAMPING,
+    FORCE_LIMIT,
+    JOINT_NAMES,
+    SKIN_LINKS,
+    STIFFNESS,
+)
+from tslam_bench.tasks import physics
+from tslam_bench.tasks.starts import Start
+
+_NO_SELF_COLLISION: Final = 1 << 29  # shapes that share an ignore bit do not collide
+
+
+class BodyPool:
+    """Cooked objects of one process, lent to its scenes: cooking is dear, moving a body between systems is cheap."""
+
+    def __init__(self) -> None:
+        self._free: dict[str, list[sapien.Entity]] = {}
+        self._count = 0
+
+    def borrow(self, start: Start) -> sapien.Entity:
+        """A body of the start's object that is in no scene."""
+        waiting = self._free.get(start.prepared.name)
+        if waiting:
+            return waiting.pop()
+        physics.configure()
+        shapes = physics.collision_shapes(start.prepared)
+        self._count += 1
+        return physics.object_entity(start.prepared, start.prepared.name, shapes, can_render=False)
+
+    def give_back(self, body: sapien.Entity) -> None:
+        """Takes a body that has left its scene."""
+        self._free.setdefault(body.name, []).append(body)
+        while self._count > physics.CACHED_BODIES and any(self._free.values()):
+            oldest = next(name for name, bodies in self._free.items() if bodies)
+            self._free[oldest].pop()
+            if not self._free[oldest]:
+                del self._free[oldest]
+            self._count -= 1
+
+
+class HandScene:
+    """A hand that explores one object at a time.
+
+    Args:
+        urdf: the converted hand.
+        bodies: where object bodies come from.
+    """
+
+    def __init__(self, urdf: Path, bodies: BodyPool) -> None:
+        physics.configure()
+        self._bodies = bodies
+        self._body: sapien.Entity | None = None
+        self._scene = sapien.Scene([physx.PhysxCpuSystem()])
+        self._robot = _build_hand(self._scene, urdf)
+        self._entities = [link.entity for link in self._robot.links]
+        joints = {joint.name: index for index, joint in enumerate(self._robot.active_joints)}
+        self._order = np.array([joints[name] for name in JOINT_NAMES])
+        self._from_order = np.argsort(self._order)
+        ordered = [self._robot.active_joints[index] for index in self._order]
+        for index, joint in enumerate(ordered):
+            joint.set_drive_properties(
+                float(STIFFNESS[index]), float(DAMPING[index]), float(FORCE_LIMIT[index]), "force"
+            )
+            joint.set_friction(0.0)
+            joint.set_armature(np.array([ARMATURE[index]], dtype=np.float32))
+        self._setters = [joint.set_drive_target for joint in ordered]
+        links = {link.name: link for link in self._robot.links}
+        self._skin_links = [links[name] for name in SKIN_LINKS]
+        self._system: Any = None
+
+    def begin(self, start: Start) -> None:
+        """Puts hand and object into a new physics system, so that nothing of the last episode remains."""
+        for entity in list(self._scene.entities):
+            self._scene.remove_entity(entity)
+        if self._body is not None:
+            self._bodies.give_back(self._body)
+        self._body = self._bodies.borrow(start)
+        physics.configure()
+        self._system = physx.PhysxCpuSystem()
+        self._system.timestep = 1.0 / PHYSICS_FREQUENCY
+        self._scene = sapien.Scene([self._system])
+        for entity in self._entities:
+            self._scene.add_entity(entity)
+        self._body.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(start.pose))
+        self._scene.add_entity(self._body)
+        qpos = start.qpos[self._from_order]
+        self._robot.set_root_pose(sapien.Pose(BASE_POSITION, BASE_QUATERNION))
+        self._robot.set_qpos(qpos)
+        self._robot.set_qvel(np.zeros_like(qpos))
+        self._robot.set_qf(np.zeros_like(qpos))
+        self.set_targets(start.qpos)
+
+    def set_targets(self, targets: NDArray[np.float32]) -> None:
+        """Sets the (28,) drive targets, in the order of ``JOINT_NAMES``."""
+        for setter, target in zip(self._setters, targets.tolist(), strict=True):
+            setter(target)
+
+    def step(self) -> None:
+        """One control step: four physics steps."""
+        for _ in range(SUBSTEPS):
+            self._system.step()
+
+    def read(self, qpos: NDArray, qvel: NDArray, link_matrices: NDArray) -> None:
+        """Writes (28,) positions, (28,) velocities and (L, 3, 4) poses of the skin links into the given arrays."""
+        qpos[:] = self._robot.qpos[self._order]
+        qvel[:] = self._robot.qvel[self._order]
+        for row, link in enumerate(self._skin_links):
+            link_matrices[row] = link.entity_pose.to_transformation_matrix()[:3]
+
+
+def _build_hand(scene: sapien.Scene, urdf: Path) -> Any:
+    loader = scene.create_urdf_loader()
+    loader.fix_root_link = True
+    builder = loader.parse(str(urdf))[0][0]
+    for link in builder.link_builders:
+        link.visual_records.clear()
+        link.collision_groups[2] |= _NO_SELF_COLLISION
+    builder.initial_pose = sapien.Pose(BASE_POSITION, BASE_QUATERNION)
+    robot = builder.build(fix_root_link=True)
+    for link in robot.links:
+        link.disable_gravity = True
+    return robot

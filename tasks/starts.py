@@ -1,0 +1,114 @@
+"""Which object, in which pose, under which hand: the start of an episode, drawn from its seed (protocol sections 3 and 8).
+
+One class for the ManiSkill task and the batched CPU engine, so that equal seeds give equal episodes in both. No torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tslam_bench import grids
+from tslam_bench.assets.store import PreparedObject, list_objects, load_object
+from tslam_bench.constants import NUM_JOINTS, NUM_POSES
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import (
+    JOINT_LIMITS,
+    JOINT_NAMES,
+    START_ARM_HIGH,
+    START_ARM_LOW,
+    START_CLEARANCE,
+    START_FINGER_NOISE,
+)
+
+LOADED_OBJECTS: Final = 64
+"""Objects kept in memory, about 10 MB each."""
+_HEIGHT = JOINT_NAMES.index("ARTy")
+_OPEN_QPOS = np.clip(0.0, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """How an episode starts.
+
+    Attributes:
+        prepared: the object.
+        pose: 0..7.
+        qpos: (28,) float32, hand open above the object, in the order of ``JOINT_NAMES``.
+    """
+
+    prepared: PreparedObject
+    pose: int
+    qpos: NDArray[np.float32]
+
+
+class StartSampler:
+    """Draws starts.
+
+    Args:
+        object: one object for every episode, or None.
+        objects: names to draw from, or None for the whole split.
+        split: split of the objects.
+        pose: one pose for every episode, or None to draw.
+
+    Raises:
+        InvalidInputError: unknown object, split or pose, or nothing to draw from.
+        AssetError: an object is not prepared.
+    """
+
+    def __init__(
+        self, object: str | None, objects: Sequence[str] | None, split: str = "test", pose: int | None = None
+    ) -> None:
+        if object is not None and objects is not None:
+            raise InvalidInputError("object and objects: give one or the other, not both")
+        self.split = split
+        self._pose = None if pose is None else grids.check_pose(pose)
+        self._load = lru_cache(maxsize=LOADED_OBJECTS)(partial(load_object, split=split))
+        if object is not None:
+            self.names: tuple[str, ...] = (self.load(object).name,)
+        elif objects is not None:
+            self.names = tuple(objects)
+        else:
+            self.names = tuple(record["name"] for record in list_objects(split))
+        if not self.names:
+            raise InvalidInputError(
+                f"split {split!r}: no objects to draw from; run 'tslam-bench assets prepare --split {split}'"
+            )
+
+    def load(self, name: str) -> PreparedObject:
+        """An object of the split; the latest ``LOADED_OBJECTS`` stay in memory."""
+        return self._load(name)
+
+    def draw_object(self, rng: np.random.RandomState, name: str | None = None) -> PreparedObject:
+        """Draws an object; ``name`` overrides the draw, which is made all the same so that the rest does not depend on it."""
+        draw = rng.uniform()
+        return self.load(self.names[int(draw * len(self.names))] if name is None else name)
+
+    def draw(
+        self,
+        rng: np.random.RandomState,
+        name: str | None = None,
+        pose: int | None = None,
+        prepared: PreparedObject | None = None,
+    ) -> Start:
+        """Draws an episode's start; ``name`` and ``pose`` override the draws, ``prepared`` is an object drawn before."""
+        chosen = self.draw_object(rng, name) if prepared is None else prepared
+        drawn_pose = int(rng.uniform() * NUM_POSES)
+        if pose is not None:
+            drawn_pose = grids.check_pose(pose)
+        elif self._pose is not None:
+            drawn_pose = self._pose
+        uniform = rng.uniform(size=NUM_JOINTS)
+        qpos = _OPEN_QPOS + START_FINGER_NOISE * (2 * uniform - 1)
+        low, high = np.array(START_ARM_LOW), np.array(START_ARM_HIGH)
+        height = chosen.vertices[:, 2]  # poses turn about z or turn upside down
+        top = -height.min() if drawn_pose >= 4 else height.max()
+        low[_HEIGHT] = max(low[_HEIGHT], top + START_CLEARANCE)
+        qpos[: len(low)] = low + (high - low) * uniform[: len(low)]
+        clipped = np.clip(qpos, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1]).astype(np.float32)
+        return Start(chosen, drawn_pose, clipped)

@@ -1,0 +1,182 @@
+"""The batched CPU environment: the ManiSkill task bit for bit, Gymnasium's semantics, and workers that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import tslam_bench
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.tasks.vector_env import WorkerError
+
+OBJECTS = ("mug", "hammer", "toruslarge")
+
+
+def actions_of(seed: int, steps: int) -> np.ndarray:
+    generator = np.random.Generator(np.random.PCG64(seed))
+    actions = generator.uniform(-1, 1, (steps, NUM_JOINTS)).astype(np.float32)
+    actions[:40, 1] = -1.0
+    return actions
+
+
+@pytest.mark.parametrize("control_mode", ["pd_joint_delta_pos", "pd_joint_pos"])
+def test_bit_for_bit_the_maniskill_task_over_episodes_objects_and_poses(control_mode):
+    num_envs, steps = 3, HORIZON + 30  # into the second episode, whose object and pose the generator draws on
+    envs = tslam_bench.make_vec(
+        ENVIRONMENT_ID, num_envs, "cpu", objects=OBJECTS, processes=2, control_mode=control_mode
+    )
+    single = gym.make(ENVIRONMENT_ID, objects=OBJECTS, control_mode=control_mode)
+    actions = np.stack([actions_of(env, steps) for env in range(num_envs)], axis=1)
+    observation, info = envs.reset(seed=7)
+    batch = [(observation, None, None, info)]
+    for step in range(steps):
+        observation, reward, terminated, truncated, info = envs.step(actions[step])
+        assert not terminated.any()
+        batch.append((observation, reward, truncated, info))
+    touched = 0
+    for env in range(num_envs):
+        expected, _ = single.reset(seed=7 + env)
+        for step in range(steps + 1):
+            observation, reward, truncated, info = batch[step]
+            if step:
+                expected, expected_reward, _, expected_truncated, expected_info = single.step(actions[step - 1, env])
+                assert reward[env] == expected_reward.numpy()[0]
+                assert truncated[env] == expected_truncated.numpy()[0]
+                assert info["new_touched"][env] == int(expected_info["new_touched"])
+                assert info["new_visited"][env] == int(expected_info["new_visited"])
+                if truncated[env]:
+                    final = info["final_obs"]
+                    for key, value in expected.items():
+                        np.testing.assert_array_equal(final[key][env], value[0].numpy(), err_msg=f"final {key}")
+                    touched += int(final["occupancy"][env, 0].sum())
+                    expected, _ = single.reset()
+            for key, value in expected.items():
+                np.testing.assert_array_equal(observation[key][env], value[0].numpy(), err_msg=f"{key}, step {step}")
+    assert touched > 0, "the comparison has to include contact"
+    envs.close()
+    single.close()
+
+
+def test_the_number_of_processes_does_not_matter():
+    results = []
+    for processes in (1, 3):
+        envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", object="mug", processes=processes)
+        envs.reset(seed=1)
+        for action in actions_of(0, 60):
+            observation, reward, *_ = envs.step(np.repeat(action[None], 3, axis=0))
+        results.append((observation, reward))
+        envs.close()
+    for key in results[0][0]:
+        np.testing.assert_array_equal(results[0][0][key], results[1][0][key])
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+
+
+def test_spaces_options_and_partial_resets():
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", objects=OBJECTS, processes=1)
+    assert envs.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
+    observation, info = envs.reset(seed=0, options={"object": ["hammer", "mug"], "pose": 6})
+    assert envs.observation_space.contains(observation)
+    assert set(info) == {"elapsed_steps", "new_touched", "new_visited"}
+    state = envs.state()
+    assert state["object_name"] == ["hammer", "mug"] and state["pose"] == [6, 6]
+    for action in actions_of(0, 20):
+        observation, *_ = envs.step(np.repeat(action[None], 2, axis=0))
+    kept = {key: value[0].copy() for key, value in observation.items()}
+    observation, info = envs.reset(options={"reset_mask": np.array([False, True]), "pose": 1})
+    for key, value in kept.items():
+        np.testing.assert_array_equal(observation[key][0], value, err_msg="the other environment goes on")
+    assert info["elapsed_steps"].tolist() == [20, 0] and observation["occupancy"][1].sum() == 0
+    envs.close()
+    with pytest.raises(WorkerError, match="closed"):
+        envs.step(np.zeros((2, NUM_JOINTS), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs 0: must be a whole number from 1"),
+        ({"num_envs": 10**9}, "num_envs 1000000000"),
+        ({"num_envs": 2, "processes": 0}, "processes 0"),
+        ({"num_envs": 2, "device": "tpu"}, "device 'tpu': unknown"),
+        ({"num_envs": 2, "object": "mugg"}, "mugg"),
+        ({"num_envs": 2, "pose": 9}, "pose 9"),
+        ({"num_envs": 2, "reward_mode": "dense"}, "reward_mode 'dense'"),
+        ({"num_envs": 2, "environment_id": "TactileSLAM-v9"}, "environment 'TactileSLAM-v9': unknown"),
+        pytest.param(
+            {"num_envs": 2, "device": "cuda"},
+            "no CUDA GPU",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, so this is no error"),
+        ),
+    ],
+)
+def test_bad_arguments_get_one_line(arguments, message):
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        tslam_bench.make_vec(**{"device": "cpu", **arguments})
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_actions_and_dead_workers():
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
+    envs.reset(seed=0)
+    good = np.zeros((2, NUM_JOINTS), np.float32)
+    for bad, message in (
+        (good[:1], r"shape \(1, 28\), expected \(2, 28\)"),
+        (np.where(np.arange(NUM_JOINTS) == 1, np.nan, good), "not finite for joint ARTy of environment 0"),
+        ("up", "not an array of numbers"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            envs.step(bad)
+    envs.step(good)  # refused actions harm nothing
+    processes = [process for process, _ in envs._workers]
+    os.kill(processes[1].pid, signal.SIGKILL)
+    started = time.monotonic()
+    with pytest.raises(WorkerError, match=r"worker 1: died \(exit code -9\)"):
+        for _ in range(3):
+            envs.step(good)
+    assert time.monotonic() - started < 20
+    assert not any(process.is_alive() for process in processes), "no worker is left behind"
+
+
+def test_nothing_is_left_when_the_parent_is_killed():
+    code = """
+        import sys, time, tslam_bench
+        if __name__ == "__main__":
+            envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=2)
+            envs.reset(seed=0)
+            print(*[process.pid for process, _ in envs._workers], flush=True)
+            time.sleep(60)
+    """
+    before = set(Path("/dev/shm").iterdir()) if Path("/dev/shm").exists() else set()
+    parent = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(pids) == 2
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline and any(Path(f"/proc/{pid}/stat").exists() for pid in pids):
+        if all(_is_zombie(pid) for pid in pids):
+            break
+        time.sleep(0.1)
+    assert all(_is_zombie(pid) for pid in pids), "workers outlive their parent"
+    if before:
+        assert set(Path("/dev/shm").iterdir()) <= before, "shared memory is left behind"
+
+
+def _is_zombie(pid: int) -> bool:
+    """Gone, or dead and waiting for whoever inherited it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -89,13 +90,13 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Runs ``tslam-bench assets``. Exits with status 2 and one line on standard error for bad input."""
     command: Any = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         args=arguments,
         prog="tslam-bench assets",
         description="Prepare, list, show and verify the benchmark's objects.",
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    handlers = {Prepare: _prepare, List: _list, Show: _show, Verify: _verify}
+    handlers: dict[type, Callable[[Any], None]] = {Prepare: _prepare, List: _list, Show: _show, Verify: _verify}
     try:
         handlers[type(command)](command)
     except BenchmarkError as error:
@@ -116,7 +117,9 @@ def _sources(command: Prepare) -> tuple[list[Any], int | None]:
         raise InvalidInputError(f"--count {command.count}: must be at least 1")
     if split == "test":
         if command.source is not None or command.count is not None:
-            raise InvalidInputError("--source and --count: the test split is fixed; use --objects NAME ... for a part of it")
+            raise InvalidInputError(
+                "--source and --count: the test split is fixed; use --objects NAME ... for a part of it"
+            )
         names = command.objects or (QUICK_OBJECTS if command.quick else tuple(contactdb.OBJECTS))
         resolved = dict.fromkeys(store.resolve_name(name, "test") for name in names)
         return [ContactDBSource(name) for name in resolved], None
@@ -166,7 +169,9 @@ def _prepare(command: Prepare) -> None:
             if outcome.status == "prepared":
                 gates = outcome.record["gates"] if outcome.record else {}
                 why = f" (rebuilt: {outcome.message})" if outcome.message else ""
-                bar.write(f"{outcome.name}: {outcome.record['hull_count']} hulls, hull IoU {gates['hull_iou']:.3f}{why}")
+                bar.write(
+                    f"{outcome.name}: {outcome.record['hull_count']} hulls, hull IoU {gates['hull_iou']:.3f}{why}"
+                )
             elif outcome.status in ("rejected", "failed"):
                 bar.write(outcome.message)
                 failures += [outcome.message] if outcome.status == "failed" else []
@@ -192,9 +197,10 @@ def _list(command: List) -> None:
         split = store.check_split(command.split)
         print(f"no object of split {split} is prepared; run: tslam-bench assets prepare --split {split}")
         return
-    table = Table(title=f"split {store.check_split(command.split)}: {len(records)} objects")
-    for heading in ("name", "category", "aliases", "extents (cm)", "volume (cm3)", "hulls", "hull IoU", "field error (mm)"):
-        table.add_column(heading, justify="left" if heading in ("name", "category", "aliases") else "right")
+    table = Table(box=None, pad_edge=False)
+    left = ("name", "category", "aliases")
+    for heading in (*left, "extents cm", "volume cm3", "hulls", "hull IoU", "field error mm"):
+        table.add_column(heading, justify="left" if heading in left else "right", no_wrap=True)
     for record in records:
         gates = record["gates"]
         table.add_row(
@@ -204,15 +210,18 @@ def _list(command: List) -> None:
             " x ".join(f"{100 * x:.1f}" for x in record["extents_m"]),
             f"{1e6 * record['volume_m3']:.0f}",
             str(record["hull_count"]),
-            f"{gates['hull_iou']:.3f}" + ("" if gates["hull_iou_passes"] else " *"),
+            f"{gates['hull_iou']:.3f}" + (" " if gates["hull_iou_passes"] else "*"),
             f"{1e3 * gates['field_error_m']:.2f}",
         )
-    Console().print(table)
+    console = Console()
+    console = Console(width=max(console.width, 110))  # a pipe has no width; names must not be cut
+    console.print(table)
     if not all(record["gates"]["hull_iou_passes"] for record in records):
-        print("* below the gate of 0.85")
+        print("* below the gate of 0.85 (docs/objects.md gives the reasons)")
 
 
 def _show(command: Show) -> None:
+    store.load_object(command.name, command.split)
     raise AssetError("show is not available yet; see: tslam-bench assets list")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import zipfile
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -115,7 +116,7 @@ def decompose_cached(mesh: TriangleMesh, settings: DecompositionSettings, direct
         try:
             with np.load(path) as data:
                 return unpack_hulls(data["vertices"], data["faces"], data["offsets"])
-        except (OSError, ValueError, KeyError, IndexError):
+        except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
             path.unlink(missing_ok=True)  # a damaged entry is computed again
     hulls = decompose(mesh, settings)
     vertices, faces, offsets = pack_hulls(hulls)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -80,7 +79,7 @@ def fetch_wheel(name: str, version: str, sha256: str, cache: Path | None = None)
                 "the package index does not serve the pinned file"
             )
         target = directory / wheel.name
-        os.replace(wheel, target)
+        wheel.replace(target)
     return target
 
 

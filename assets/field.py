@@ -130,8 +130,8 @@ def _fit_points(
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     on_surface, _ = sample_surface(solid.surface, int(SURFACE_DENSITY * area / spacing**2), generator)
     cells = np.argwhere(np.abs(exact[:-1, :-1, :-1]) < BAND + spacing)
-    near = np.repeat(cells, CELL_POINTS, axis=0)
-    near = origin + spacing * (near + generator.random(near.shape))
+    corner = np.repeat(cells, CELL_POINTS, axis=0)
+    near = origin + spacing * (corner + generator.random(corner.shape))
     distance = solid.signed_distance(near)
     kept = np.abs(distance) < 1.25 * BAND
     points = np.concatenate([on_surface, near[kept]])

@@ -206,7 +206,9 @@ def teapot(g: Random) -> tuple[Manifold, int]:
     knob = ellipsoid(0.18, 0.18, 0.16).translate([0, 0, height + 0.1])
     lid = cylinder(0.4, 0.16).translate([0, 0, height])
     reach = g.uniform(0.65, 1.0)
-    spout_path = spline([(0.6, 0, 0.3 * height), (1.2, 0, 0.45 * height), (1 + reach, 0, g.uniform(0.85, 1.1) * height)], 28)
+    spout_path = spline(
+        [(0.6, 0, 0.3 * height), (1.2, 0, 0.45 * height), (1 + reach, 0, g.uniform(0.85, 1.1) * height)], 28
+    )
     spout = sweep(spout_path, 0.24, scale=np.linspace(1.0, g.uniform(0.45, 0.6), 28))
     bulge = g.uniform(1.6, 1.9)
     handle_path = spline(
@@ -237,7 +239,9 @@ def ring_or_lathe(outline: np.ndarray) -> Manifold:
 def jar(g: Random) -> tuple[Manifold, int]:
     """A squat jar with a lid and a knob."""
     height = g.uniform(1.1, 1.9)
-    body = lathe(smooth_profile([(0.75, 0), (1.0, 0.35 * height), (g.uniform(0.8, 1.0), 0.9 * height), (0.75, height)], 36))
+    body = lathe(
+        smooth_profile([(0.75, 0), (1.0, 0.35 * height), (g.uniform(0.8, 1.0), 0.9 * height), (0.75, height)], 36)
+    )
     lid = cylinder(g.uniform(0.8, 0.95), 0.18).translate([0, 0, height + 0.08])
     knob = ellipsoid(0.22, 0.22, g.uniform(0.16, 0.24)).translate([0, 0, height + 0.28])
     return join(body, lid, knob), 0
@@ -282,7 +286,9 @@ def screwdriver(g: Random) -> tuple[Manifold, int]:
     lobes, depth = int(g.integers(4, 8)), g.uniform(0.04, 0.1)
     angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     radius = g.uniform(0.28, 0.38)
-    outline = (radius * (1 - depth * (1 + np.cos(lobes * angle))))[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    outline = (radius * (1 - depth * (1 + np.cos(lobes * angle))))[:, None] * np.column_stack(
+        [np.cos(angle), np.sin(angle)]
+    )
     handle = prism(outline, grip) ^ lathe(smooth_profile([(0.24, -grip / 2), (0.42, -0.2 * grip), (0.42, 0.2 * grip),
                                                           (0.3, grip / 2)], 24))  # fmt: skip
     blade = cylinder(g.uniform(0.09, 0.12), shaft).translate([0, 0, grip / 2 + shaft / 2 - 0.05])
@@ -362,7 +368,7 @@ def comb(g: Random) -> tuple[Manifold, int]:
 @_category("train", 0.06, 0.2)
 def carton(g: Random) -> tuple[Manifold, int]:
     """A box, sometimes with a gabled top."""
-    x, y, z = g.uniform(0.5, 1.0, 3) + [0, 0, 0.4]
+    x, y, z = g.uniform(0.5, 1.0, 3) + np.array([0, 0, 0.4])
     body = box(x, y, z, g.uniform(0.0, 0.08))
     if g.random() < 0.4:
         roof = prism([(-y / 2, 0), (y / 2, 0), (0.04, 0.35), (-0.04, 0.35)], x)
@@ -414,7 +420,7 @@ def book(g: Random) -> tuple[Manifold, int]:
 @_category("train", 0.06, 0.16)
 def bangle(g: Random) -> tuple[Manifold, int]:
     """A thick ring, plain or set with a stone."""
-    section = superellipse(g.uniform(0.14, 0.28), g.uniform(0.14, 0.4), g.uniform(2, 4), 28) + [1.0, 0.0]
+    section = superellipse(g.uniform(0.14, 0.28), g.uniform(0.14, 0.4), g.uniform(2, 4), 28) + np.array([1.0, 0.0])
     solid = ring(section, 64)
     if g.random() < 0.4:
         solid = join(solid, ellipsoid(0.35, 0.3, 0.3).translate([1.2, 0, 0]))
@@ -447,14 +453,13 @@ def padlock(g: Random) -> tuple[Manifold, int]:
 def spectacles(g: Random) -> tuple[Manifold, int]:
     """Unfolded spectacles with thick rims."""
     a, b, power = g.uniform(0.5, 0.6), g.uniform(0.38, 0.5), g.uniform(2.0, 3.5)
-    rim, depth = g.uniform(0.11, 0.15), g.uniform(0.16, 0.22)
+    rim, depth, length = g.uniform(0.11, 0.15), g.uniform(0.16, 0.22), g.uniform(1.7, 2.1)
     parts = []
     for sign in (-1, 1):
-        outline = superellipse(a, b, power) + [sign * (a + 0.12), 0]
-        hole = superellipse(a - rim, b - rim, power) + [sign * (a + 0.12), 0]
+        centre = np.array([sign * (a + 0.12), 0])
+        outline, hole = superellipse(a, b, power) + centre, superellipse(a - rim, b - rim, power) + centre
         parts.append(prism(outline, depth, holes=[hole]).rotate([90, 0, 0]))
         x = sign * (2 * a + 0.1)
-        length = g.uniform(1.7, 2.1) if sign < 0 else length
         path = spline([(x, -0.02, 0.1), (x, 0.3, 0.12), (x, 0.7 * length, 0.1), (x, length, -0.3)], 28)
         parts.append(sweep(path, superellipse(0.075, 0.1, 2.5, 16), side=(0, 0, 1)))
     bridge = box(0.4, depth, 0.14).translate([0, 0, 0.05])
@@ -497,7 +502,9 @@ def chair(g: Random) -> tuple[Manifold, int]:
 def table_lamp(g: Random) -> tuple[Manifold, int]:
     """A lamp with a closed shade."""
     height = g.uniform(1.4, 2.2)
-    stand = lathe(smooth_profile([(0.6, 0), (0.5, 0.15), (0.14, 0.4), (g.uniform(0.14, 0.35), 0.6 * height), (0.14, height)], 36))
+    stand = lathe(
+        smooth_profile([(0.6, 0), (0.5, 0.15), (0.14, 0.4), (g.uniform(0.14, 0.35), 0.6 * height), (0.14, height)], 36)
+    )
     shade = cylinder(g.uniform(0.8, 1.0), g.uniform(0.8, 1.1), g.uniform(0.4, 0.65)).translate([0, 0, height + 0.3])
     return join(stand, shade), 0
 
@@ -535,11 +542,13 @@ def quadruped(g: Random) -> tuple[Manifold, int]:
     size = g.uniform(0.3, 0.42)
     parts.append(capsule([length * 0.35, 0, 0.1], head, 0.3, 0.24))
     parts.append(ellipsoid(size * g.uniform(1.0, 1.4), size, size).translate(head))
-    parts.append(capsule(head, head + [size + g.uniform(0.1, 0.35), 0, -0.1], 0.2, 0.16))
+    parts.append(capsule(head, head + np.array([size + g.uniform(0.1, 0.35), 0, -0.1]), 0.2, 0.16))
     for sy in (-1, 1):
-        ear = head + [-0.1, sy * size * 0.7, size * g.uniform(0.9, 1.5)]
-        parts.append(capsule(head + [-0.05, sy * size * 0.6, 0.1], ear, 0.13, 0.1))
-    parts.append(capsule([-length / 2, 0, 0.1], [-length / 2 - g.uniform(0.25, 0.6), 0, g.uniform(-0.3, 0.6)], 0.14, 0.1))
+        ear = head + np.array([-0.1, sy * size * 0.7, size * g.uniform(0.9, 1.5)])
+        parts.append(capsule(head + np.array([-0.05, sy * size * 0.6, 0.1]), ear, 0.13, 0.1))
+    parts.append(
+        capsule([-length / 2, 0, 0.1], [-length / 2 - g.uniform(0.25, 0.6), 0, g.uniform(-0.3, 0.6)], 0.14, 0.1)
+    )
     return join(*parts), 0
 
 
@@ -583,7 +592,7 @@ def doughnut_stack(g: Random) -> tuple[Manifold, int]:
     shrink = g.uniform(0.78, 0.88)
     for _ in range(count):
         tube = g.uniform(0.2, 0.28) * (0.5 + 0.5 * radius)
-        parts.append(ring(circle(tube, 28) + [radius - tube, 0], 56).translate([0, 0, z]))
+        parts.append(ring(circle(tube, 28) + np.array([radius - tube, 0]), 56).translate([0, 0, z]))
         parts.append(cylinder(radius - tube, 2 * tube * 0.9).translate([0, 0, z]))
         z += 2 * tube * 0.92
         radius *= shrink
@@ -619,7 +628,9 @@ def mushroom(g: Random) -> tuple[Manifold, int]:
 def rocket(g: Random) -> tuple[Manifold, int]:
     """A toy rocket with fins."""
     height = g.uniform(2.4, 3.4)
-    body = lathe(smooth_profile([(0.4, 0), (g.uniform(0.55, 0.7), 0.4 * height), (0.4, 0.75 * height), (0.06, height)], 44))
+    body = lathe(
+        smooth_profile([(0.4, 0), (g.uniform(0.55, 0.7), 0.4 * height), (0.4, 0.75 * height), (0.06, height)], 44)
+    )
     count, reach = int(g.integers(3, 5)), g.uniform(0.9, 1.3)
     fin = prism([(0, 0.05), (reach, -0.35), (reach, 0.15), (0, g.uniform(0.9, 1.3))], 0.16).rotate([90, 0, 0])
     return join(body, *[fin.rotate([0, 0, 360 * k / count]) for k in range(count)]), 0

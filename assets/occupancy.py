@@ -38,7 +38,7 @@ def surface_grid(mesh: TriangleMesh) -> NDArray[np.bool_]:
     count = np.where(outside, 0, size.prod(axis=1))
     triangle = np.repeat(np.arange(len(count)), count)
     rank = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
-    sx, sy, sz = size[triangle].T
+    _sx, sy, sz = size[triangle].T
     voxel = low[triangle] + np.stack([rank // (sy * sz), rank // sz % sy, rank % sz], axis=1)
     met = voxel[_triangle_meets_cube(corners[triangle] - (voxel + 0.5)[:, None])]
     grid[tuple(met.T)] = True

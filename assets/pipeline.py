@@ -115,7 +115,9 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
         hull_solid = decompose.hull_union(hulls)
         truth_solid = to_manifold(ground_truth)
         iou = decompose.intersection_over_union(hull_solid, truth_solid)
-        if iou < MIN_HULL_IOU and item.split != "test":  # the test split is given; elsewhere another object takes its place
+        if (
+            iou < MIN_HULL_IOU and item.split != "test"
+        ):  # the test split is given; elsewhere another object takes its place
             raise GateError(f"gate: IoU(hull union, ground truth) {iou:.3f} is below {MIN_HULL_IOU}")
         distances = field.build_field(hulls)
         points, faces = occupancy.surface_samples(ground_truth)

@@ -109,7 +109,9 @@ def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
     return lines[0] if lines else None
 
 
-def prepare(items: Iterable[Any], count: int | None = None, cache: Path | None = None, workers: int = 2) -> Iterator[Outcome]:
+def prepare(
+    items: Iterable[Any], count: int | None = None, cache: Path | None = None, workers: int = 2
+) -> Iterator[Outcome]:
     """Prepares objects, skipping those that are intact; yields each object's outcome as it is known.
 
     Can be interrupted at any time: every object is written as a whole or not at all. Objects that a gate rejected are

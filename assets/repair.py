@@ -61,6 +61,9 @@ def repair(mesh: TriangleMesh) -> Repaired:
     Raises:
         AssetError: nothing solid can be made of it.
     """
+    a, b, c = mesh.triangles().transpose(1, 0, 2)
+    if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+        raise AssetError("the mesh has no area")
     method: Method = "kept"
     solid = to_manifold(mesh, merge=True)
     if is_valid(solid) and solid.volume() < 0:
@@ -175,7 +178,11 @@ def remesh_by_ball(mesh: TriangleMesh) -> TriangleMesh:
     spacing, radius = longest / BALL_CELLS, longest * BALL_SHARE
     origin, shape = grid_around(mesh, spacing, 2 * radius + 3 * spacing)
     distance = ndimage.distance_transform_edt(~near_surface(mesh, origin, spacing, shape)) * spacing
+    band = np.abs(distance - radius) < 2 * spacing
+    distance[band] = distance_to_mesh(origin + np.argwhere(band) * spacing, mesh)
     regions, _ = ndimage.label(distance >= radius)
     centres = regions == regions[0, 0, 0]
-    to_centres = ndimage.distance_transform_edt(~centres) * spacing
-    return isosurface(radius - BALL_OFFSET * spacing - to_centres, origin, spacing)
+    to_centres, nearest = ndimage.distance_transform_edt(~centres, return_indices=True)
+    # The nearest sample with room for the ball has a little room to spare: the ball itself can come that much closer.
+    spare = distance[tuple(nearest)] - radius
+    return isosurface(radius - BALL_OFFSET * spacing - (to_centres * spacing - spare), origin, spacing)

@@ -102,12 +102,9 @@ def sweep(
         side: direction that the section's second axis leans to.
     """
     points = np.asarray(path, dtype=float)
-    corners = circle(float(section), 20) if np.isscalar(section) else np.asarray(section, dtype=float)
+    corners = circle(section, 20) if isinstance(section, float | int) else np.asarray(section, dtype=float)
     factors = np.ones(len(points)) if scale is None else np.asarray(scale, dtype=float)
-    if closed:
-        tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
-    else:
-        tangent = np.gradient(points, axis=0)
+    tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0) if closed else np.gradient(points, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     up = np.asarray(side, dtype=float)
     if np.abs(tangent @ up).max() > 0.99:  # the path runs along that direction somewhere: carry a frame along it

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import itertools
 import json
 import re
 from collections.abc import Iterable
@@ -226,10 +227,7 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
         faces = arrays["faces"].astype(np.int64)
         hull_vertices, hull_faces = arrays["hull_vertices"], arrays["hull_faces"].astype(np.int64)
         offsets = arrays["hull_offsets"].tolist()
-        hulls = tuple(
-            (hull_vertices[v0:v1], hull_faces[f0:f1])
-            for (v0, f0), (v1, f1) in zip(offsets[:-1], offsets[1:], strict=True)
-        )
+        hulls = tuple((hull_vertices[v0:v1], hull_faces[f0:f1]) for (v0, f0), (v1, f1) in itertools.pairwise(offsets))
         field = SignedDistanceField(
             origin=np.array(record["field"]["origin"], dtype=np.float64),
             spacing=float(record["field"]["spacing"]),

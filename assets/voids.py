@@ -1,8 +1,8 @@
 """Fills inner voids that touch can never feel (protocol section 8).
 
 A void is *enclosed* when some ball of radius 4 mm or less fits into it but cannot get out. A closed shell's inside is one;
-so is the inside of a pot whose openings are narrower than the pot. Open slits, grooves and holes are not, however narrow they are: a ball
-small enough to be in one can leave it. The outside surface stays as it is.
+so is the inside of a pot whose openings are narrower than that. Open slits, grooves and holes are not, however narrow they
+are: a ball small enough to be in one can leave it. The outside surface stays as it is.
 """
 
 from __future__ import annotations

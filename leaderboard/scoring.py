@@ -5,6 +5,7 @@ Rollouts are not replayed: a score says ``verified: false`` until something has 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import multiprocessing
@@ -129,6 +130,7 @@ class SubmissionScore:
         info: what the submission says about itself.
         content_hash: SHA-256 of its files.
         objects: names, in the order of scoring.
+        asset_sha256: hash of the objects' products that were scored against.
         results: one per object and seed.
         aggregate: ``"4"``, ``"8"`` and ``"exploration"`` -> metric -> estimate over objects and seeds.
         notes: one line each: what a reader of the figures should know.
@@ -138,6 +140,7 @@ class SubmissionScore:
     info: SubmissionInfo
     content_hash: str
     objects: tuple[str, ...]
+    asset_sha256: str
     results: tuple[ObjectScore, ...]
     aggregate: dict[str, dict[str, Estimate]]
     notes: tuple[str, ...]
@@ -158,6 +161,7 @@ class SubmissionScore:
             "content_hash": self.content_hash,
             "verified": self.verified,
             "objects": list(self.objects),
+            "asset_sha256": self.asset_sha256,
             "results": [dataclasses.asdict(result) for result in self.results],
             "aggregate": {
                 group: {name: dataclasses.asdict(estimate) for name, estimate in estimates.items()}
@@ -176,6 +180,7 @@ class SubmissionScore:
                 info=parse_info(json.dumps(value["submission"]).encode()),
                 content_hash=str(value["content_hash"]),
                 objects=tuple(value["objects"]),
+                asset_sha256=str(value["asset_sha256"]),
                 results=tuple(ObjectScore(**result) for result in value["results"]),
                 aggregate={
                     group: {name: Estimate(**estimate) for name, estimate in estimates.items()}
@@ -219,6 +224,7 @@ def score_submission(
         info=submission.info,
         content_hash=submission.content_hash,
         objects=names,
+        asset_sha256=asset_sha256(names, cache=cache),
         results=tuple(results),
         aggregate=aggregate(results, len(names)),
         notes=_notes(submission, results, names, cache),
@@ -383,20 +389,24 @@ def _notes(
     notes = []
     if tuple(names) != object_set(submission.info.object_set):
         notes.append(f"scored on {len(names)} chosen objects, not on the object set {submission.info.object_set!r}")
+    empty: dict[str, list[str]] = {}
     for result in results:
         where = f"{result.object}, seed {result.seed}"
         if result.missing:
-            notes.append(f"{where}: counted as empty, missing: {', '.join(result.missing)}")
+            notes.append(f"{where}: missing, counted as empty: {', '.join(result.missing)}")
         for protocol, reason in result.reasons.items():
             if reason is not None and reason != "missing":
-                notes.append(f"{where}, {protocol} poses: counted as empty, {reason}")
+                empty.setdefault(reason, []).append(f"{where}, {protocol} poses")
         if result.implausible_touches > 0:
             share = f"{100 * result.implausible_touches:.1f} %"
             notes.append(f"{where}: {share} of the touched voxels are too far from the object to hold a contact")
-    try:
-        own = asset_sha256(object_set(submission.info.object_set), cache=cache)
-        if own != submission.info.asset_manifest_sha256:
-            notes.append("the rollouts were made with other assets than the ones scored against")
-    except AssetError:
-        notes.append("the asset hash was not compared: not every object of the set is prepared here")
+    for reason, places in empty.items():
+        more = f" and {len(places) - 3} more" if len(places) > 3 else ""
+        notes.append(f"counted as empty, {reason}: {'; '.join(places[:3])}{more}")
+    # A submission hashes the objects it holds: the whole set, or the chosen ones.
+    hashes = [asset_sha256(names, cache=cache)]
+    with contextlib.suppress(AssetError):
+        hashes.append(asset_sha256(object_set(submission.info.object_set), cache=cache))
+    if submission.info.asset_manifest_sha256 not in hashes:
+        notes.append("the rollouts were made with other assets, or of other objects, than the ones scored against")
     return tuple(notes)

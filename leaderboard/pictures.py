@@ -1,0 +1,178 @@
+"""Pictures of touched grid, reconstruction and true mesh, from one camera per object, as small WebP files.
+
+A picture that was made is kept in a folder under a name that depends on all that is in it, so a page is rebuilt in seconds
+and a run that was killed goes on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from tslam_bench.assets.store import PreparedObject, asset_sha256, load_object
+from tslam_bench.constants import NUM_POSES
+from tslam_bench.files import atomic_file
+from tslam_bench.leaderboard.prediction import invalid_mesh
+from tslam_bench.leaderboard.render import Camera, Colour, fit_camera, render, voxels_to_mesh
+from tslam_bench.leaderboard.scoring import merge_touched_steps
+from tslam_bench.leaderboard.submission import EXPLORATION_ORDER, Submission, read_submission
+from tslam_bench.reconstruction.volume import Volume
+
+PICTURE_SIZE: Final = 232
+"""Pixels across a picture; its height depends on the object."""
+PICTURE_VERSION: Final = 4
+"""Part of a stored picture's name: raise it when pictures of the same content look different."""
+
+Kind = Literal["truth", "touched", "reconstruction"]
+COLOURS: Final[dict[Kind, Colour]] = {
+    "truth": (0.70, 0.72, 0.76),
+    "touched": (0.91, 0.50, 0.20),
+    "reconstruction": (0.29, 0.53, 0.86),
+}
+_QUALITY: Final = 82
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What to show.
+
+    Attributes:
+        kind: the true mesh, the voxels touched after 8 poses, or the reconstruction from them.
+        object: name in the test split.
+        submission: folder or zip archive; None for the true mesh.
+        content_hash: of the submission, or of the touched voxels; empty for the true mesh.
+        seed: of the submission.
+
+    Two pictures are equal if they show the same; the path is not compared.
+    """
+
+    kind: Kind
+    object: str
+    submission: Path | None = field(default=None, compare=False)
+    content_hash: str = ""
+    seed: int = 0
+
+    def file_name(self, asset: str) -> str:
+        """Name of the stored picture; ``asset`` identifies the object's geometry."""
+        key = repr((PICTURE_VERSION, PICTURE_SIZE, self.kind, self.object, self.content_hash, self.seed, asset))
+        return f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.webp"
+
+
+def make_pictures(
+    pictures: Sequence[Picture],
+    folder: Path,
+    workers: int = 1,
+    on_progress: Callable[[int, int], None] | None = None,
+    cache: Path | None = None,
+) -> dict[Picture, bytes]:
+    """WebP bytes (transparent background) of every picture that has something to show.
+
+    Args:
+        folder: where pictures are kept; those that are there are not made again.
+        workers: processes that draw.
+        on_progress: called with (done, all).
+        cache: asset cache.
+    """
+    paths = {picture: folder / picture.file_name(_asset(picture.object, cache)) for picture in pictures}
+    missing = [picture for picture in paths if not paths[picture].is_file()]
+    done = len(paths) - len(missing)
+    if on_progress:
+        on_progress(done, len(paths))
+    # One process draws all of one object: its mesh is loaded once.
+    groups = [[p for p in missing if p.object == name] for name in dict.fromkeys(p.object for p in missing)]
+    arguments = [([(picture, paths[picture]) for picture in group], cache) for group in groups]
+    if workers <= 1 or len(groups) <= 1:
+        for drawn in map(_draw_group, arguments):
+            done += drawn
+            if on_progress:
+                on_progress(done, len(paths))
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(workers, len(groups)), mp_context=context) as pool:
+            for drawn in pool.map(_draw_group, arguments):
+                done += drawn
+                if on_progress:
+                    on_progress(done, len(paths))
+    content = {picture: path.read_bytes() for picture, path in paths.items()}
+    return {picture: data for picture, data in content.items() if data}
+
+
+def _draw_group(arguments: tuple[list[tuple[Picture, Path]], Path | None]) -> int:
+    pictures, cache = arguments
+    for picture, path in pictures:
+        data = draw(picture, load_object(picture.object, cache=cache))
+        with atomic_file(path) as temporary:
+            temporary.write_bytes(data)
+    return len(pictures)
+
+
+def draw(picture: Picture, prepared: PreparedObject) -> bytes:
+    """WebP bytes of one picture; empty bytes if there is nothing to show."""
+    truth = trimesh.Trimesh(prepared.vertices, prepared.faces, process=False)
+    mesh = truth if picture.submission is None else _subject(picture, _open(picture.submission, picture.content_hash))
+    if len(mesh.faces) == 0:
+        return b""
+    camera, size = object_camera(truth)
+    pixels = render([(mesh, COLOURS[picture.kind])], camera, size, None, float(truth.bounds[0, 2]), sky_rays=8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format="WEBP", quality=_QUALITY, alpha_quality=100, method=4)
+    return stream.getvalue()
+
+
+def object_camera(truth: trimesh.Trimesh) -> tuple[Camera, tuple[int, int]]:
+    """Camera and (width, height) of all pictures of one object.
+
+    They hold its true mesh with room for a reconstruction that is a little large; flat objects get flat pictures.
+    """
+    square = fit_camera([truth], azimuth=-60, elevation=25, margin=1.22)
+    seen = np.ptp(truth.vertices @ square.axes().T, axis=0)
+    height = round(PICTURE_SIZE * float(np.clip((seen[1] / seen[0]), 0.55, 1.0)))
+    camera = fit_camera([truth], azimuth=-60, elevation=25, margin=1.22, aspect=PICTURE_SIZE / height)
+    return camera, (PICTURE_SIZE, height)
+
+
+def _subject(picture: Picture, submission: Submission) -> trimesh.Trimesh:
+    nothing = trimesh.Trimesh()
+    if picture.kind == "touched":
+        rollouts = {pose: submission.rollout(picture.object, pose, picture.seed) for pose in EXPLORATION_ORDER}
+        return voxels_to_mesh(merge_touched_steps(rollouts) >= 0)
+    reconstruction = submission.reconstruction(picture.object, NUM_POSES, picture.seed)
+    if isinstance(reconstruction, Volume):
+        if reconstruction.interpolation == "nearest" and reconstruction.resolution == 32:
+            return voxels_to_mesh(reconstruction.probability >= 0.5, fill=0.97)
+        return reconstruction.to_mesh()
+    return nothing if reconstruction is None or invalid_mesh(reconstruction) else reconstruction
+
+
+@lru_cache(maxsize=64)
+def _open(path: Path, content_hash: str) -> Submission:
+    """The submission without another check; ``content_hash`` keys the cache."""
+    return read_submission(path, check=False)
+
+
+@lru_cache(maxsize=64)
+def _asset(name: str, cache: Path | None) -> str:
+    return asset_sha256([name], cache=cache)
+
+
+def touched_picture(path: Path, submission: Submission, name: str, seed: int) -> Picture | None:
+    """The picture of what was touched after 8 poses; None without any rollout of the object.
+
+    It is keyed by the grid itself: submissions that differ in the reconstructor only share it.
+    """
+    rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
+    if not any(rollouts.values()):
+        return None
+    touched = merge_touched_steps(rollouts) >= 0
+    return Picture("touched", name, path, hashlib.sha256(touched.tobytes()).hexdigest(), seed)

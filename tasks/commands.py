@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -72,8 +72,15 @@ Command = (
 
 def main(arguments: Sequence[str]) -> None:
     """Runs ``tslam-bench env`` with the given arguments. Raises BenchmarkError for bad input."""
-    command: Any = tyro.cli(Command, args=list(arguments), prog="tslam-bench env", description=__doc__)  # type: ignore[call-overload]
-    {List: _list, Describe: _describe, Video: _video}[type(command)](command)
+    command: Any = tyro.cli(
+        Command,
+        args=list(arguments),
+        prog="tslam-bench env",
+        description="List the environments, describe their spaces, record a video.",
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    handlers: dict[type, Callable[[Any], None]] = {List: _list, Describe: _describe, Video: _video}
+    handlers[type(command)](command)
 
 
 def environment_rows() -> list[dict[str, Any]]:

@@ -20,7 +20,13 @@ _COMMANDS = {
 
 
 def _usage() -> str:
-    lines = ["usage: tslam-bench COMMAND ...", "", "A benchmark for tactile exploration and reconstruction.", "", "commands:"]
+    lines = [
+        "usage: tslam-bench COMMAND ...",
+        "",
+        "A benchmark for tactile exploration and reconstruction.",
+        "",
+        "commands:",
+    ]
     lines += [f"  {name:12} {summary}" for name, (_, _, summary) in _COMMANDS.items()]
     return "\n".join([*lines, "", "tslam-bench COMMAND --help tells more."])
 

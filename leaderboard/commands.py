@@ -115,12 +115,12 @@ def page_main(arguments: Sequence[str]) -> None:
     score_files, submission_paths = find_inputs(paths)
     if not score_files and not submission_paths:
         raise InvalidInputError(f"{paths[0]}: holds neither submissions nor score files; run tslam-bench score first")
-    ensure_writable_directory(parsed.output)
     scores = [_read_score(path) for path in score_files]
     submissions: dict[str, tuple[Path, Submission]] = {}
     for path in submission_paths:
         submission = read_submission(path)
         submissions.setdefault(submission.content_hash, (path, submission))
+    ensure_writable_directory(parsed.output)  # before hours of scoring, not after
     scores = _score_missing(scores, submissions, parsed.workers)
     leaderboard = rank(scores)
 

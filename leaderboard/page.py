@@ -265,7 +265,7 @@ def _ranking_row(entry: Mapping[str, Any], number: int) -> str:
     iou = entry["aggregate"]["8"]["iou"]
     cells = [
         f'<td class="rank" data-value="{rank or ""}">{rank or "&ndash;"}</td>',
-        f'<th scope="row" data-value="{escape(info["explorer"])}">{escape(info["explorer"])}{badge}{small}</th>',
+        f'<th scope="row" data-value="{escape(info["explorer"])}">{_name(info["explorer"])}{badge}{small}</th>',
         f'<td class="left" data-value="{escape(info["reconstructor"])}">{escape(info["reconstructor"])}</td>',
         f'<td class="key" data-value="{iou["mean"]:.6f}">{iou["mean"]:.3f}<small>{iou["low"]:.3f}&ndash;{iou["high"]:.3f}</small>'
         f"{_bar(iou)}</td>",
@@ -402,7 +402,7 @@ def _per_object(table: Mapping[str, Any]) -> str:
             f'<td class="cell" style="--v:{value:.3f}" data-value="{value:.6f}">{value:.2f}</td>'
             for value in (entry["per_object"][name]["8"]["iou"] for name in objects)
         )
-        label = f"{escape(info['explorer'])} <small>+ {escape(info['reconstructor'])}</small>"
+        label = f"{_name(info['explorer'])} <small>+ {escape(info['reconstructor'])}</small>"
         rows.append(
             f'<tr><td class="rank" data-value="{entry["rank"] or ""}">{entry["rank"] or "&ndash;"}</td>'
             f'<th scope="row" data-value="{escape(info["explorer"])}">{label}</th>{cells}</tr>'
@@ -473,10 +473,15 @@ def _gallery_row(explorer: Explorer, name: str, reconstructors: Sequence[str], i
                 figures.append(_captioned(image, alternative, "IoU", value))
         cells.append(f"<td>{''.join(figures)}</td>")
     badge = ' <span class="badge">privileged</span>' if explorer.privileged else ""
-    return f'<tr><th scope="row">{escape(explorer.label)}{badge}</th>{"".join(cells)}</tr>'
+    return f'<tr><th scope="row">{_name(explorer.label)}{badge}</th>{"".join(cells)}</tr>'
 
 
 # --- Pieces ----------------------------------------------------------------------------------------------------
+
+
+def _name(identifier: str) -> str:
+    """An identifier that may be broken after an underscore."""
+    return escape(identifier).replace("_", "_<wbr>")
 
 
 def _set_name(table: Mapping[str, Any]) -> str:

@@ -287,7 +287,7 @@ def _score_seed(submission: Submission, truth: Truth, seed: int) -> ObjectScore:
             values, found = score_reconstruction(reconstruction, truth)
             shape = dict(values)
             protocols[str(count)], reasons[str(count)] = {**shape, **touch}, reason or found
-        elif reconstruction is not None and not absent:
+        elif reconstruction is not None and (reference or not absent):
             solid = prepare(reconstruction, iou_points(), samples=0).solid
             shape = {"iou": metrics.iou(solid, truth.prepared.solid_at_iou_points)}
         poses[str(count)] = {**touch, "iou": shape.get("iou")}

@@ -202,16 +202,36 @@ def test_placed_shapes_are_centred_in_the_workspace(wedge, continuous):
 
 def test_simulated_touches_lie_on_the_surface_and_the_hand_stays_outside(ball):
     generator = np.random.default_rng(5)
+    sweeps = 0
     for _ in range(6):
         placed = place(ball, generator)
         touches = simulate_touches(placed, generator)
         radius = 0.05 * placed.scale
-        assert np.abs(np.linalg.norm(touches.contact_points, axis=1) - radius).max() < 6e-3  # 6 standard deviations
+        assert np.abs(np.linalg.norm(touches.contact_points, axis=1) - radius).max() < 2e-3  # 6 standard deviations
         assert np.array_equal(touches.touched, grids.points_to_grid(touches.contact_points))
-        # The lookup's samples are 4 mm apart: no swept point is deeper than half a diagonal of its cells.
-        assert np.linalg.norm(touches.swept_points, axis=1).min() > radius - 0.5 * np.sqrt(3) * 0.004 * placed.scale
-        assert np.array_equal(touches.visited, grids.points_to_grid(touches.swept_points))
-        assert touches.visited.sum() > 100
+        # The lookup's samples are 4 mm apart: no finger point is deeper than half a diagonal of its cells.
+        depth = radius - np.linalg.norm(touches.finger_points, axis=1)
+        assert depth.max() < 0.5 * np.sqrt(3) * 0.004 * placed.scale
+        # Swept voxels lie outside altogether: their centres are at least the mesh's sagitta and half an edge away.
+        distances = np.linalg.norm(grids.voxel_centres()[touches.swept_voxels], axis=1)
+        assert distances.min(initial=1.0) > radius + 0.4 * VOXEL_EDGE
+        assert np.array_equal(touches.visited, grids.points_to_grid(touches.finger_points) | touches.swept_voxels)
+        assert (touches.touched & touches.visited).sum() > 0.6 * touches.touched.sum()
+        sweeps += touches.swept_voxels.sum()
+    assert sweeps > 6 * 500
+
+
+def test_simulated_sweeps_stay_out_of_closed_rooms():
+    """A hollow box: nothing gets in."""
+    outer, inner = trimesh.creation.box((0.14, 0.14, 0.14)), trimesh.creation.box((0.1, 0.1, 0.1))
+    inner.invert()
+    placed = place(shape_of(trimesh.util.concatenate([outer, inner])), np.random.default_rng(0), (1.0, 1.0))
+    simulation = TouchSimulation(approaches=(8, 8), touched_voxels=(100, 100), sweeps=(20, 20))
+    room = np.abs(grids.voxel_centres()).max(axis=-1) < 0.04
+    for seed in range(3):
+        touches = simulate_touches(placed, np.random.default_rng(seed), simulation)
+        assert not (touches.visited & room).any()
+        assert touches.swept_voxels.sum() > 10_000
 
 
 def test_simulated_touches_reach_the_number_aimed_at(torus):
@@ -220,7 +240,7 @@ def test_simulated_touches_reach_the_number_aimed_at(torus):
         placed = place(torus, generator, (1.0, 1.0))
         simulation = TouchSimulation(touched_voxels=(aimed, aimed), approaches=(8, 8))
         touched = simulate_touches(placed, generator, simulation).touched.sum()
-        assert aimed <= touched <= aimed + 40  # the last patch may go over
+        assert aimed <= touched <= aimed + 30  # the last patch may go over
 
 
 def test_examples_depend_on_the_generator_alone(torus, wedge):

@@ -19,6 +19,8 @@ from tslam_bench.reconstruction.volume import Volume
 
 FAR_VOXELS: Final = 3.0
 """A touched voxel at least this far (voxel edges) from a shape's surface speaks against it with full weight."""
+FREE_WEIGHT: Final = 0.5
+"""Weight of free space against touch, chosen on rollouts of val objects."""
 
 
 def _check_shapes(name: str, grids: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -70,8 +72,8 @@ class RetrievalReconstructor:
     """The training shape, in one of the 24 rotations that map axes to axes, that agrees best with touch and free space.
 
     The disagreement is the mean over touched voxels of their distance to the shape's surface voxels, in units of
-    :data:`FAR_VOXELS` and at most 1, plus the share of free voxels (visited, not touched) in the shape's solid, relative
-    to the solid's size. Nothing touched: empty, since nothing was felt that could be looked up.
+    :data:`FAR_VOXELS` and at most 1, plus :data:`FREE_WEIGHT` times the share of the shape's solid that is known to be
+    free (visited, not touched). Nothing touched: empty, since nothing was felt that could be looked up.
 
     Args:
         solids: (S, 32, 32, 32) bool, the training objects' solid voxels.
@@ -91,7 +93,7 @@ class RetrievalReconstructor:
         distances = [distance_transform_edt(~surface) for surface in surfaces]
         self._surface_cost = (np.minimum(np.stack(distances), FAR_VOXELS) / FAR_VOXELS).astype(np.float32)
         sizes = np.maximum(self._solids.sum(axis=(1, 2, 3)), 1)
-        self._solid_cost = (self._solids / sizes[:, None, None, None]).astype(np.float32)
+        self._solid_cost = (FREE_WEIGHT * self._solids / sizes[:, None, None, None]).astype(np.float32)
 
     def best_match(
         self, touched: NDArray[np.bool_], visited: NDArray[np.bool_]

@@ -102,7 +102,8 @@ def train(
         The trained reconstructor, or None if ``stop`` ended the run.
 
     Raises:
-        InvalidInputError: no shapes; a value of ``config`` out of range; or ``output`` or its progress file is of another training run.
+        InvalidInputError: no shapes; a value of ``config`` out of range; or ``output`` or its progress file is of
+            another training run.
         AssetError: the output folder cannot be written.
     """
     config.check()

@@ -22,8 +22,8 @@ from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
 from tslam_bench.leaderboard.aggregate import Estimate
-from tslam_bench.leaderboard.page import TOUCHED_AS_THEY_ARE, build_page
-from tslam_bench.leaderboard.pictures import Picture, make_pictures, touched_picture
+from tslam_bench.leaderboard.page import build_page
+from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
 from tslam_bench.leaderboard.ranking import rank
 from tslam_bench.leaderboard.scoring import SubmissionScore, score_submission
 from tslam_bench.leaderboard.submission import INFO_FILE, Submission, read_submission
@@ -189,7 +189,7 @@ def plan_pictures(
                 touched = touched_picture(path, submission, name, seed)
                 if touched:
                     pictures["touched", key, name] = touched
-                if touched is None or submission.info.reconstructor != TOUCHED_AS_THEY_ARE:
+                if submission.info.reconstructor != TOUCHED_AS_THEY_ARE:
                     pictures["reconstruction", key, name] = Picture("reconstruction", name, path, key, seed)
     return pictures
 

@@ -22,6 +22,7 @@ from tslam_bench.constants import (
     VOXEL_EDGE,
 )
 from tslam_bench.leaderboard.charts import Axis, Line, line_chart
+from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE
 from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES
 
 Images = Mapping[tuple[str, str, str], bytes]
@@ -29,8 +30,6 @@ Images = Mapping[tuple[str, str, str], bytes]
 
 OPEN_OBJECTS: Final = 2
 """Objects of the gallery that are unfolded when the page opens."""
-TOUCHED_AS_THEY_ARE: Final = "grid"
-"""The reconstructor whose pictures would repeat the touched voxels."""
 
 
 @dataclass(frozen=True)
@@ -348,7 +347,7 @@ def _exploration(explorers: Sequence[Explorer], spacing: int) -> str:
                 points = [(float(position), value) for position, value in found if value is not None]
                 if len(points) > 1:
                     chosen.append(Line(explorer.label, explorer.colour, points, dashed=explorer.privileged))
-        if chosen:
+        if len(chosen) > 1:
             panel = line_chart(
                 f"IoU after 1, 2, 4 and 8 poses, reconstructor {reconstructor}",
                 chosen,
@@ -446,12 +445,6 @@ def _gallery(table: Mapping[str, Any], explorers: Sequence[Explorer], images: Im
 
 def _gallery_row(explorer: Explorer, name: str, reconstructors: Sequence[str], images: Images) -> str:
     keys = [("touched", entry["content_hash"], name) for entry in explorer.entries]
-    if not explorer.curve:  # a reference has no rollouts; its grid is what it says it touched
-        keys = [
-            ("reconstruction", entry["content_hash"], name)
-            for entry in explorer.entries
-            if entry["submission"]["reconstructor"] == TOUCHED_AS_THEY_ARE
-        ]
     touched = next((images[key] for key in keys if key in images), None)
     recall = explorer.entries[0]["per_object"][name]["8"]["touched_surface_recall"]
     if touched is None:

@@ -388,7 +388,7 @@ def _notes(
 ) -> tuple[str, ...]:
     notes = []
     if tuple(names) != object_set(submission.info.object_set):
-        notes.append(f"scored on {len(names)} chosen objects, not on the object set {submission.info.object_set!r}")
+        notes.append(f"scored on chosen objects ({len(names)}), not on the object set {submission.info.object_set!r}")
     empty: dict[str, list[str]] = {}
     for result in results:
         where = f"{result.object}, seed {result.seed}"

@@ -22,10 +22,9 @@ def test_linear_query_agrees_with_scipy(resolution: int) -> None:
     points = WORKSPACE_LOW + WORKSPACE_EDGE * generator.random((500, 3))
     axis = WORKSPACE_LOW + (np.arange(resolution) + 0.5) * WORKSPACE_EDGE / resolution
     clamped = np.clip(points, axis[0], axis[-1])
-    if resolution == 1:
-        expected = np.full(500, values[0, 0, 0])
-    else:
-        expected = RegularGridInterpolator((axis,) * 3, values)(clamped)
+    expected = (
+        np.full(500, values[0, 0, 0]) if resolution == 1 else RegularGridInterpolator((axis,) * 3, values)(clamped)
+    )
     np.testing.assert_allclose(Volume(values).query(points), expected, atol=1e-6)
 
 

@@ -234,7 +234,9 @@ def test_touches_far_from_the_object_are_found(box) -> None:
 def test_score_files_round_trip(tmp_path: Path, truth: Truth, box) -> None:
     source = submission(tmp_path / "s", box)
     results = score_object(source, truth)
-    score = SubmissionScore(INFO, source.content_hash, ("box",), tuple(results), aggregate(results, 1), ("a note",))
+    score = SubmissionScore(
+        INFO, source.content_hash, ("box",), "1" * 64, tuple(results), aggregate(results, 1), ("a note",)
+    )
     text = json.dumps(score.to_json(), allow_nan=False)
     again = SubmissionScore.from_json(json.loads(text), "file")
     assert again.to_json() == score.to_json()

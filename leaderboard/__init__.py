@@ -1,1 +1,1 @@
-"""See docs/architecture.md."""
+"""Metrics, submissions, scoring, ranking, pictures and the page. Imports no simulator and no torch."""

@@ -68,6 +68,10 @@ class Backend(ABC):
         """Rows and columns that a computation has to cover for ``mask`` (E, P), in order: on the host, the True ones."""
 
     @abstractmethod
+    def count_set(self, rows: Array) -> Array:
+        """(E,) int64, how many elements of boolean rows (E, n) are set; n is a multiple of 8."""
+
+    @abstractmethod
     def count_rows(self, flags: Array, rows: Array, num_rows: int) -> Array:
         """(num_rows,) int64, how many of ``flags`` are set per row."""
 
@@ -126,6 +130,11 @@ class NumpyBackend(Backend):
     def select(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rows, columns = np.nonzero(mask)
         return rows, columns
+
+    @override
+    def count_set(self, rows: np.ndarray) -> np.ndarray:
+        # A True is one byte with one bit: counting bits of whole words is several times faster than adding bytes.
+        return np.bitwise_count(rows.view(np.uint64)).sum(axis=1, dtype=np.int64)
 
     @override
     def count_rows(self, flags: np.ndarray, rows: np.ndarray, num_rows: int) -> np.ndarray:
@@ -198,6 +207,10 @@ class TorchBackend(Backend):
         count, width = mask.shape
         flat = self.module.arange(count * width, device=self.device)
         return flat // width, flat % width
+
+    @override
+    def count_set(self, rows: Array) -> Array:
+        return rows.sum(1)
 
     @override
     def count_rows(self, flags: Array, rows: Array, num_rows: int) -> Array:

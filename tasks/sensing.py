@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tslam_bench import grids
 from tslam_bench.assets.store import SignedDistanceField
@@ -131,9 +132,12 @@ class TactileSensing:
         self.num_envs = num_envs
         self.backend = backend
         self._xp: ModuleType = backend.module
+        self._num_links = int(skin.volume.link.max()) + 1
+        blocks, block_of_probe = _blocks(skin.probes)
+        self._blocks = _BoundPoints(blocks, backend)
+        self._block_of_probe = backend.array(block_of_probe)
         self._probes = _BoundPoints(skin.probes, backend)
         self._volume = _BoundPoints(skin.volume, backend)
-        self._num_links = int(skin.volume.link.max()) + 1
         self._probe_reach = backend.array(skin.probes.radius + np.float32(TOUCH_DISTANCE))
         link_of_probe = np.zeros((len(skin.probes), self._num_links), dtype=bool)
         link_of_probe[np.arange(len(skin.probes)), skin.probes.link] = True
@@ -145,10 +149,10 @@ class TactileSensing:
         self._touched = zeros(flat, bool)
         self._visited = zeros(flat, bool)
         self._touched_step = backend.full(flat, -1, np.int16)
-        self._winner = zeros(flat, np.int64)
+        self._touched_count = zeros(num_envs, np.int64)
+        self._visited_count = zeros(num_envs, np.int64)
         self._on = zeros((num_envs, len(skin.probes)), bool)
         self._env_base = backend.array(np.arange(num_envs, dtype=np.int64)[:, None] * VOXELS)
-        self._env_row = backend.array(np.arange(num_envs, dtype=np.int64)[:, None])
 
         # Per environment, of its object and pose; host copies, pushed to the device after a reset.
         self._objects: list[tuple[str, SignedDistanceField] | None] = [None] * num_envs
@@ -190,7 +194,8 @@ class TactileSensing:
         for grid, value in ((self._touched, False), (self._visited, False), (self._touched_step, -1)):
             rows = grid[:-1].reshape(self.num_envs, VOXELS)
             rows[list(envs)] = value
-        self._on[list(envs)] = False
+        for cleared in (self._on, self._touched_count, self._visited_count):
+            cleared[list(envs)] = 0
 
     def _bind(self) -> None:
         objects = [entry for entry in self._objects if entry is not None]
@@ -206,9 +211,9 @@ class TactileSensing:
         spacings = [float(field.spacing) for _, field in objects]
         strides = [(ny * nz, nz, 1) for _, ny, nz in sizes]
         self._offset = array(np.array(offsets, dtype=np.int64)[:, None])
-        self._stride = [array(np.array([s[a] for s in strides], dtype=np.int64)[:, None]) for a in range(3)]
-        self._last_cell = [array(np.array([s[a] - 2 for s in sizes], dtype=np.float32)[:, None]) for a in range(3)]
-        self._origin = [array(np.array([o[a] for o in origins], dtype=np.float32)[:, None]) for a in range(3)]
+        self._stride = array(np.array(strides, dtype=np.int64).T[:, :, None].copy())
+        self._last_cell = array((np.array(sizes, dtype=np.float32) - 2).T[:, :, None].copy())
+        self._origin = array(np.array(origins, dtype=np.float32).T[:, :, None].copy())
         self._inverse_spacing = array((1.0 / np.array(spacings)).astype(np.float32)[:, None])
         # A sample is at most half a cell diagonal away from a point, and distance is 1-Lipschitz.
         self._cull_margin = array((np.sqrt(3.0) / 2 * 1.001 * np.array(spacings)).astype(np.float32)[:, None])
@@ -244,44 +249,47 @@ class TactileSensing:
         return (self._on.to(self._link_of_probe.dtype) @ self._link_of_probe) > 0  # 0/1 sums: exact
 
     def _touch(self, link_matrices: Array) -> tuple[Array, _Felt]:
-        """(E, P) probes on, and the probes near the surface with what their contact points need."""
-        xp, backend = self._xp, self.backend
+        """(E, P) probes on, and the probes that may be, with what their contact points need."""
+        backend = self.backend
         # Into the object's frame: exact, since a turn is a signed permutation and the other products are zero.
-        turned = (self._turn[:, None, :, :, None] * link_matrices[:, :, :, None, :]).sum(2)
-        placed = self._probes.place(turned)
-        u = [(p - o) * self._inverse_spacing for p, o in zip(placed, self._origin, strict=True)]
-        nearest = self._offset
-        for axis in range(3):
-            cell = backend.clip(xp.floor(u[axis] + 0.5), 0.0, self._last_cell[axis] + 1.0)
-            nearest = nearest + backend.integer(cell) * self._stride[axis]
-        near = backend.take(self.atlas.values, nearest) <= self._probe_reach + self._cull_margin
-        rows, columns = backend.select(near)
-        cells = _Cells(self, [c[rows, columns] for c in u], rows)
-        flags = (cells.value <= self._probe_reach[columns]) & near[rows, columns]
-        on = backend.zeros(near.shape, bool)
+        turned = backend.link_components((self._turn[:, None, :, :, None] * link_matrices[:, :, :, None, :]).sum(2))
+        rows, columns = backend.select(self._near_blocks(turned)[:, self._block_of_probe])
+        placed = self._probes.place_some(turned, rows, columns)
+        cells = _Cells(self, (placed - self._origin[:, rows, 0]) * self._inverse_spacing[rows, 0], rows)
+        flags = cells.value <= self._probe_reach[columns]
+        on = backend.zeros((self.num_envs, len(self._probe_reach)), bool)
         on[rows, columns] = flags
-        return on, _Felt(rows, columns, flags, [p[rows, columns] for p in placed], cells)
+        return on, _Felt(rows, columns, flags, placed, cells)
+
+    def _near_blocks(self, turned: Array) -> Array:
+        """(E, B) bool: blocks of probes that are not certainly clear of the object."""
+        xp, backend = self._xp, self.backend
+        u = (self._blocks.place(turned) - self._origin) * self._inverse_spacing
+        # Outside the field's box the nearest sample's value is less than the true distance: no block is lost.
+        cell = backend.integer(backend.clip(xp.floor(u + 0.5), 0.0, self._last_cell + 1.0)) * self._stride
+        nearest = backend.take(self.atlas.values, self._offset + cell[0] + cell[1] + cell[2])
+        return nearest <= self._blocks.radius + self._cull_margin
 
     def _touch_voxels(self, felt: _Felt, new: Array, step: Array) -> tuple[Array, Array, Array]:
         backend, xp, rows = self.backend, self._xp, felt.rows
-        gradient = felt.cells.unit_gradient()
-        on_surface = [p - felt.cells.value * g for p, g in zip(felt.placed, gradient, strict=True)]
+        on_surface = felt.placed - felt.cells.value * felt.cells.unit_gradient()
         turn = self._turn[rows]
-        world = [
-            turn[:, a, 0] * on_surface[0] + turn[:, a, 1] * on_surface[1] + turn[:, a, 2] * on_surface[2]
-            for a in range(3)
-        ]
-        key = xp.where(felt.flags, self._voxel_key(world, self._env_base[rows, 0]), self.num_envs * VOXELS)
-        fresh = self._first_of_each(self._touched, key)
-        backend.put(self._touched_step, xp.where(fresh, key, self.num_envs * VOXELS), backend.int16(step[rows]))
+        world = xp.stack(
+            [
+                turn[:, a, 0] * on_surface[0] + turn[:, a, 1] * on_surface[1] + turn[:, a, 2] * on_surface[2]
+                for a in range(3)
+            ]
+        )
+        outside = self.num_envs * VOXELS
+        key = xp.where(felt.flags, self._voxel_key(world, self._env_base[rows, 0]), outside)
+        fresh = xp.where(backend.take(self._touched, key), outside, key)
+        backend.put(self._touched_step, fresh, backend.int16(step[rows]))
         self._touched_step[-1] = -1
-        backend.put(self._touched, key, True)
-        self._touched[-1] = False
-        new_touched = backend.count_rows(fresh, rows, self.num_envs)
+        new_touched = self._mark(self._touched, self._touched_count, key)
         points, mask = self._new_points(world, felt.flags & new[rows, felt.columns], rows)
         return new_touched, points, mask
 
-    def _new_points(self, world: list[Array], flags: Array, rows: Array) -> tuple[Array, Array]:
+    def _new_points(self, world: Array, flags: Array, rows: Array) -> tuple[Array, Array]:
         """The first MAX_NEW_CONTACTS flagged points of each environment, in probe order."""
         backend, xp = self.backend, self._xp
         points = backend.zeros((self.num_envs, MAX_NEW_CONTACTS + 1, 3), np.float32)
@@ -297,34 +305,45 @@ class TactileSensing:
         return points[:, :MAX_NEW_CONTACTS], mask[:, :MAX_NEW_CONTACTS]
 
     def _visit_voxels(self, link_matrices: Array) -> Array:
-        key = self._voxel_key(self._volume.place(link_matrices), self._env_base)
-        fresh = self._first_of_each(self._visited, key)
-        self.backend.put(self._visited, key, True)
-        self._visited[-1] = False
-        return fresh.sum(1)
+        placed = self._volume.place(self.backend.link_components(link_matrices))
+        return self._mark(self._visited, self._visited_count, self._voxel_key(placed, self._env_base))
 
-    def _voxel_key(self, points: list[Array], base: Array) -> Array:
-        """Flat voxel index of points, or the spare last element where they lie outside W."""
-        xp = self._xp
-        inside, key = None, base
-        for axis, stride in zip(range(3), (GRID_SIZE * GRID_SIZE, GRID_SIZE, 1), strict=True):
-            cell = xp.floor((points[axis] - np.float32(WORKSPACE_LOW).item()) * np.float32(1 / VOXEL_EDGE).item())
-            within = (cell >= 0) & (cell < GRID_SIZE)
-            inside = within if inside is None else inside & within
-            key = key + self.backend.integer(cell) * stride
-        return xp.where(inside, key, self.num_envs * VOXELS)
+    def _mark(self, grid: Array, count: Array, key: Array) -> Array:
+        """Sets voxels and returns how many that adds per environment, (E,) int64; keeps ``count`` up to date."""
+        self.backend.put(grid, key, True)
+        grid[-1] = False
+        now = self.backend.count_set(grid[:-1].reshape(self.num_envs, VOXELS))
+        added = now - count
+        count[:] = now
+        return added
 
-    def _first_of_each(self, grid: Array, key: Array) -> Array:
-        """True for exactly one entry per voxel that ``key`` names and ``grid`` does not hold yet.
+    def _voxel_key(self, points: Array, base: Array) -> Array:
+        """Flat voxel index of points (3, ...), or the spare last element where they lie outside W."""
+        scaled = (points - np.float32(WORKSPACE_LOW).item()) * np.float32(1 / VOXEL_EDGE).item()
+        x, y, z = self.backend.integer(self._xp.floor(scaled))
+        inside = ((x | y | z) & ~(GRID_SIZE - 1)) == 0  # all within 0..31: no bit above the fifth, no sign
+        key = base + ((x * GRID_SIZE + y) * GRID_SIZE + z)
+        return self._xp.where(inside, key, self.num_envs * VOXELS)
 
-        Which entry wins a voxel is not defined, how many win is: the count is deterministic on any device.
-        """
-        backend = self.backend
-        flat = key.reshape(-1)
-        order = backend.arange(flat.shape[0])
-        backend.put(self._winner, flat, order)
-        first = (backend.take(self._winner, flat) == order) & ~backend.take(grid, flat)
-        return (first & (flat != self.num_envs * VOXELS)).reshape(key.shape)
+
+BLOCK_EDGE = 25e-3
+"""Probes of a link are tested for nearness in blocks of this edge (m)."""
+
+
+def _blocks(probes: PointSet) -> tuple[PointSet, NDArray[np.int64]]:
+    """Blocks of neighbouring probes (centre, radius within which any of its probes can touch), and each probe's block."""
+    cell = np.floor(probes.position / BLOCK_EDGE).astype(np.int64)
+    _, block = np.unique(np.column_stack([probes.link, cell]), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    links, centres, radii = [], [], []
+    for index in range(int(block.max()) + 1):
+        position = probes.position[block == index].astype(np.float64)
+        centre = (position.min(axis=0) + position.max(axis=0)) / 2
+        reach = np.linalg.norm(position - centre, axis=1) + probes.radius[block == index] + TOUCH_DISTANCE
+        links.append(probes.link[block == index][0])
+        centres.append(centre)
+        radii.append(reach.max() + 1e-5)  # for rounding
+    return PointSet(np.array(links), np.array(centres, dtype=np.float32), np.array(radii, dtype=np.float32)), block
 
 
 class _BoundPoints:
@@ -333,60 +352,65 @@ class _BoundPoints:
     def __init__(self, points: PointSet, backend: Backend) -> None:
         self._backend = backend
         self._link = backend.array(points.link)
-        self._local = [backend.array(np.ascontiguousarray(points.position[:, a])) for a in range(3)]
+        self._num_points = len(points)
+        self._local = backend.array(np.ascontiguousarray(points.position.T))
+        self.radius = backend.array(points.radius)
 
-    def place(self, link_matrices: Array) -> list[Array]:
-        """Coordinates, three (E, P) arrays, for link poses (E, L, 3, 4)."""
-        parts = self._backend.link_components(link_matrices)
-        taken = self._backend.take_last(parts, self._link)
-        x, y, z = self._local
-        return [
-            taken[4 * row] * x + taken[4 * row + 1] * y + taken[4 * row + 2] * z + taken[4 * row + 3]
-            for row in range(3)
-        ]
+    def place(self, components: Array) -> Array:
+        """(3, E, P) coordinates of all points for link poses (12, E, L)."""
+        taken = self._backend.take_last(components, self._link).reshape(3, 4, -1, self._num_points)
+        return _apply(taken, self._local)
+
+    def place_some(self, components: Array, rows: Array, columns: Array) -> Array:
+        """(3, n) coordinates of the listed points for link poses (12, E, L)."""
+        flat = components.reshape(12, -1)
+        index = rows * components.shape[2] + self._link[columns]
+        return _apply(self._backend.take_last(flat, index).reshape(3, 4, -1), self._local[:, columns])
+
+
+def _apply(poses: Array, local: Array) -> Array:
+    """Rigid transforms (3, 4, ...) of points (3, ...), as elementwise multiply-adds."""
+    return poses[:, 0] * local[0] + poses[:, 1] * local[1] + poses[:, 2] * local[2] + poses[:, 3]
 
 
 @dataclass(frozen=True)
 class _Felt:
-    """Probes near the surface: a list of them, in order of environment and probe.
+    """Probes that may be on: a list of them, in order of environment and probe.
 
     Attributes:
         rows, columns: environment and probe of each.
         flags: whether it is on.
-        placed: three coordinate arrays in the object's frame (m).
+        placed: (3, n) coordinates in the object's frame (m).
         cells: the field around it.
     """
 
     rows: Array
     columns: Array
     flags: Array
-    placed: list[Array]
+    placed: Array
     cells: _Cells
 
 
 class _Cells:
-    """Trilinear interpolation of the fields at a list of points: grid coordinates ``u``, environments ``rows``.
+    """Trilinear interpolation of the fields at a list of points: grid coordinates ``u`` (3, n), environments ``rows``.
 
     ``value`` is the signed distance (m).
     """
 
-    def __init__(self, sensing: TactileSensing, u: list[Array], rows: Array) -> None:
+    def __init__(self, sensing: TactileSensing, u: Array, rows: Array) -> None:
         xp, backend = sensing._xp, sensing.backend
-        index, fraction = sensing._offset[rows, 0], []
-        strides = []
-        for axis in range(3):
-            low = backend.clip(xp.floor(u[axis]), 0.0, sensing._last_cell[axis][rows, 0])
-            fraction.append(backend.clip(u[axis] - low, 0.0, 1.0))
-            strides.append(sensing._stride[axis][rows, 0])
-            index = index + backend.integer(low) * strides[axis]
-        self._xp, self._fraction = xp, fraction
+        low = backend.clip(xp.floor(u), 0.0, sensing._last_cell[:, rows, 0])
+        self._xp, self._fraction = xp, backend.clip(u - low, 0.0, 1.0)
+        strides = sensing._stride[:, rows, 0]
+        cell = backend.integer(low) * strides
+        index = sensing._offset[rows, 0] + cell[0] + cell[1] + cell[2]
         values = sensing.atlas.values
         corner = {}
         for i in (0, 1):
             for j in (0, 1):
+                edge = index + i * strides[0] + j * strides[1]  # the stride of z is 1
                 for k in (0, 1):
-                    at = index + i * strides[0] + j * strides[1] + k * strides[2]
-                    corner[i, j, k] = backend.take(values, at)
+                    corner[i, j, k] = backend.take(values, edge + k)
         self._corner = corner
         self.value = self._interpolate()
 
@@ -396,14 +420,14 @@ class _Cells:
         along_y = {k: along_x[0, k] + fy * (along_x[1, k] - along_x[0, k]) for k in (0, 1)}
         return along_y[0] + fz * (along_y[1] - along_y[0])
 
-    def unit_gradient(self) -> list[Array]:
-        """Gradient of the trilinear field, scaled to length 1."""
+    def unit_gradient(self) -> Array:
+        """(3, n) gradient of the trilinear field, scaled to length 1."""
         c, (fx, fy, fz) = self._corner, self._fraction
         gx = _bilinear(fy, fz, *(c[1, j, k] - c[0, j, k] for j in (0, 1) for k in (0, 1)))
         gy = _bilinear(fx, fz, *(c[i, 1, k] - c[i, 0, k] for i in (0, 1) for k in (0, 1)))
         gz = _bilinear(fx, fy, *(c[i, j, 1] - c[i, j, 0] for i in (0, 1) for j in (0, 1)))
         length = self._xp.sqrt(gx * gx + gy * gy + gz * gz) + 1e-12
-        return [gx / length, gy / length, gz / length]
+        return self._xp.stack([gx / length, gy / length, gz / length])
 
 
 def _bilinear(a: Array, b: Array, v00: Array, v01: Array, v10: Array, v11: Array) -> Array:

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from tslam_bench.assets import contactdb, store
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
+from tslam_bench.files import atomic_file
 
 QUICK_GENERATED = {"train": 24, "val": 6}
 """Generated objects of the quick run."""
@@ -221,8 +222,16 @@ def _list(command: List) -> None:
 
 
 def _show(command: Show) -> None:
-    store.load_object(command.name, command.split)
-    raise AssetError("show is not available yet; see: tslam-bench assets list")
+    from tslam_bench.assets.pictures import object_picture
+
+    prepared = store.load_object(command.name, command.split)
+    path = command.output or Path(f"{prepared.name}.png")
+    if path.suffix.lower() != ".png":
+        raise InvalidInputError(f"--output {path}: must end in .png")
+    picture = object_picture(prepared)
+    with atomic_file(path.absolute()) as temporary:
+        picture.save(temporary)
+    print(path)
 
 
 def _verify(command: Verify) -> None:

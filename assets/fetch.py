@@ -7,11 +7,12 @@ import re
 import subprocess
 import sys
 import tempfile
+import urllib.request
 from pathlib import Path
 
-from tslam_bench.assets.sources import WheelPin
+from tslam_bench.assets.sources import FilePin, WheelPin
 from tslam_bench.errors import AssetError
-from tslam_bench.files import cache_directory, ensure_writable_directory, sha256_file
+from tslam_bench.files import atomic_file, cache_directory, ensure_writable_directory, sha256_file
 
 logger = logging.getLogger(__name__)
 
@@ -86,3 +87,43 @@ def fetch_wheel(name: str, version: str, sha256: str, cache: Path | None = None)
 def fetch(pin: WheelPin, cache: Path | None = None) -> Path:
     """:func:`fetch_wheel` for an entry of :mod:`tslam_bench.assets.sources`."""
     return fetch_wheel(pin.name, pin.version, pin.sha256, cache)
+
+
+def fetch_file(pin: FilePin, cache: Path | None = None) -> Path:
+    """Returns the path of a pinned file in ``<cache>/downloads``, downloading it first where needed.
+
+    Raises:
+        AssetError: no server hands out the pinned file, or the cache cannot be written.
+    """
+    directory = ensure_writable_directory((cache or cache_directory()) / "downloads")
+    target = directory / pin.name
+    if target.exists():
+        if sha256_file(target) == pin.sha256:
+            return target
+        logger.warning("%s: does not have the pinned SHA-256; downloading it again", target)
+    reasons = []
+    for url in pin.urls:
+        host = url.split("/")[2]
+        try:
+            with atomic_file(target) as temporary:
+                _download(url, temporary, pin.size)
+                if sha256_file(temporary) != pin.sha256:
+                    raise AssetError("does not serve the pinned file")
+            return target
+        except (OSError, ValueError, AssetError) as error:
+            reasons.append(f"{host}: {error}")
+    raise AssetError(
+        f"{pin.name}: download failed ({'; '.join(reasons)}); check the network, or put the file into {directory}"
+    )
+
+
+def _download(url: str, path: Path, size: int) -> None:
+    """Writes what a server hands out to ``path``, but never more than ``size`` bytes."""
+    request = urllib.request.Request(url, headers={"User-Agent": "tslam-bench"})
+    with urllib.request.urlopen(request, timeout=60) as response, path.open("wb") as stream:
+        left = size
+        while block := response.read(min(1 << 20, left + 1)):
+            left -= len(block)
+            if left < 0:
+                raise AssetError("sends more than the pinned file holds")
+            stream.write(block)

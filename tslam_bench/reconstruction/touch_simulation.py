@@ -26,10 +26,10 @@ class TouchSimulation:
 
     approaches: tuple[int, int] = (1, 8)
     """Directions the hand comes from: the poses that were explored."""
-    touched_voxels: tuple[int, int] | None = None
-    """Touched voxels aimed at, log-uniform; None: from 4 to 100 per approach."""
-    sweeps: tuple[int, int] = (2, 10)
-    """Balls of free space that the hand sweeps per approach."""
+    touched_voxels: tuple[int, int] = (2, 130)
+    """Touched voxels aimed at per approach, log-uniform over examples; never less than four in all."""
+    sweeps: tuple[int, int] = (1, 10)
+    """Balls of free space that the hand sweeps per approach. Examples with many sweeps tend to have many touches."""
     sweep_radius: tuple[float, float] = (0.035, 0.09)
     close_sweeps: float = 0.6
     """Share of approaches whose sweeps pass right beside the object; the others keep a voxel away from it."""
@@ -65,6 +65,7 @@ class SimulatedTouches:
 
 
 _MAX_GRASPS = 150
+_MAX_LOCAL = 2000  # surface samples looked at per grasp; they come in random order
 _STEP = 0.007  # between samples along a finger (m), below the voxel edge
 
 
@@ -91,6 +92,12 @@ def _open_space(placed: PlacedShape, surface: NDArray[np.float64]) -> tuple[NDAr
     return reached, reached & clear
 
 
+def _squared_distances(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Between points (M, 3) and (N, 3): (M, N)."""
+    x, y, z = (np.square(first[:, None, axis] - second[None, :, axis]) for axis in range(3))
+    return x + y + z
+
+
 def _is_open(space: NDArray[np.bool_], points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether points (M, 3) are in voxels of ``space`` or outside W."""
     index = np.floor((points - WORKSPACE_LOW) / VOXEL_EDGE).astype(np.int64)
@@ -100,12 +107,11 @@ def _is_open(space: NDArray[np.bool_], points: NDArray[np.float64]) -> NDArray[n
 
 
 def _sweeps(
-    direction: NDArray[np.float64], simulation: TouchSimulation, generator: np.random.Generator
+    direction: NDArray[np.float64], count: int, simulation: TouchSimulation, generator: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Voxels in balls on the side of W that the hand comes from."""
+    """Voxels in ``count`` balls on the side of W that the hand comes from."""
     half = WORKSPACE_EDGE / 2
     centres = voxel_centres()
-    count = int(generator.integers(*simulation.sweeps, endpoint=True))
     swept = np.zeros((GRID_SIZE,) * 3, dtype=bool)
     for _ in range(count):
         centre = half * (generator.uniform(0, 0.9) * direction + 0.45 * generator.standard_normal(3))
@@ -132,8 +138,11 @@ def simulate_touches(
     """Explores a placed shape for a random while. May touch fewer voxels than aimed at where little can be reached."""
     simulation = simulation or TouchSimulation()
     approaches = int(generator.integers(*simulation.approaches, endpoint=True))
-    low, high = simulation.touched_voxels or (4, 100 * approaches)
-    aimed = round(float(np.exp(generator.uniform(np.log(low), np.log(high)))))
+    activity = generator.random()
+    few, many = np.log(simulation.touched_voxels)
+    share = np.clip(activity + generator.uniform(-0.3, 0.3), 0, 1)
+    aimed = max(4, round(approaches * float(np.exp(few + share * (many - few)))))
+    least, most = simulation.sweeps
     directions = _unit(generator.standard_normal((approaches, 3)))
 
     surface, normals = placed.surface()
@@ -141,7 +150,8 @@ def simulate_touches(
     close, clear = _open_space(placed, surface)
     for direction in directions:
         space = close if generator.random() < simulation.close_sweeps else clear
-        swept |= _sweeps(direction, simulation, generator) & space
+        count = int(generator.integers(least, least + round(activity * (most - least)), endpoint=True))
+        swept |= _sweeps(direction, count, simulation, generator) & space
 
     axis, skin = _finger_samples(simulation)
     touched = np.zeros((GRID_SIZE,) * 3, dtype=bool)
@@ -151,7 +161,10 @@ def simulate_touches(
         direction = directions[generator.integers(approaches)]
         focus = surface[generator.integers(len(surface))]
         count = int(generator.integers(*simulation.contacts_per_grasp, endpoint=True))
-        around = np.flatnonzero(np.square(surface - focus).sum(axis=1) < simulation.grasp_radius**2)
+        distances = _squared_distances(focus[None], surface)[0]
+        around = np.flatnonzero(distances < simulation.grasp_radius**2)
+        beyond = np.flatnonzero(distances < (simulation.grasp_radius + simulation.patch_radius[1]) ** 2)[:_MAX_LOCAL]
+        local, local_normals = surface[beyond], normals[beyond]
         chosen = around[generator.integers(len(around), size=2 * count)]
         touches = np.arange(2 * count) < count
         gap = np.where(touches, 0.0005, generator.uniform(*simulation.near_miss_gap, 2 * count))
@@ -163,22 +176,21 @@ def simulate_touches(
         # The lookup is coarser than the gap under the tip, so skin points may seem inside: the axis decides.
         reachable = ((normal * direction).sum(axis=1) > -0.3) & ~inside[:, : len(axis)].any(axis=1)
         reachable &= _is_open(close, bodies[:, len(axis) - 1])  # the finger's base connects to the outside
+        radius = generator.uniform(*simulation.patch_radius, 2 * count)
+        patches = (_squared_distances(point, local) < radius[:, None] ** 2) & (normal @ local_normals.T > 0.3)
         for index in np.flatnonzero(reachable):
             fingers.append(bodies[index][~inside[index]])
             if not touches[index]:
                 continue
-            radius = generator.uniform(*simulation.patch_radius)
-            near = np.square(surface - point[index]).sum(axis=1) < radius**2
-            near &= normals @ normal[index] > 0.3
-            near[chosen[index]] = True
-            noise = simulation.contact_noise * generator.standard_normal((int(near.sum()), 1))
-            patch = surface[near] + noise * normals[near]
+            near = np.flatnonzero(patches[index])
+            noise = simulation.contact_noise * generator.standard_normal((len(near), 1))
+            patch = local[near] + noise * local_normals[near]
             contacts.append(patch)
-            fingers.append(surface[near] + 0.001 * normals[near])  # the skin is within 1 mm of what it touches
+            fingers.append(local[near] + 0.001 * local_normals[near])  # the skin is within 1 mm of what it touches
             touched |= points_to_grid(patch)
-            if touched.sum() >= aimed:
+            if np.count_nonzero(touched) >= aimed:
                 break
-        if touched.sum() >= aimed:
+        if np.count_nonzero(touched) >= aimed:
             break
     finger_points = np.concatenate(fingers)
     visited = swept | points_to_grid(finger_points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,10 +18,14 @@ from tqdm import tqdm
 from tslam_bench.assets import contactdb, store
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
-from tslam_bench.files import atomic_file
+from tslam_bench.files import atomic_file, cache_directory, write_json
 
 QUICK_GENERATED = {"train": 24, "val": 6}
 """Generated objects of the quick run."""
+FULL_GENERATED = {"train": 600, "val": 60}
+"""Objects of a set that is generated only."""
+ADDED_ROUNDS = 6
+"""Generated objects per category that the default set has beside the real ones."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +44,44 @@ class Prepare:
     """Only the objects of the quick run."""
     split: str = "test"
     """Split: test, train or val."""
-    source: Literal["generated"] | None = None
-    """Where train and val objects come from."""
+    source: Literal["all", "furniture", "generated"] = "all"
+    """Where train and val objects come from: real household models, the generator, or both."""
     count: int | None = None
-    """How many train or val objects."""
+    """Stop at this many train or val objects."""
+    manifest: Path | None = None
+    """Prepare a set of your own instead: a JSON file that lists its meshes (see docs/objects.md)."""
     workers: int = 2
     """Processes."""
-    manifest: Path | None = None
-    """Also write the manifest to this file."""
+    time_limit: float = 900.0
+    """Seconds after which one object is given up."""
+    write_manifest: Path | None = None
+    """Also write the split's manifest to this file."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """Import a folder tree of meshes into a split.
+
+    The category of a mesh is the folder below FOLDER that it is in. Meshes are made watertight, scaled to hand-held size,
+    decomposed and gated; a broken one is reported and skipped.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder with .obj, .dae, .glb, .gltf, .stl, .ply or .off files, or archives of one each."""
+    license: str
+    """Licence of the meshes."""
+    source: str
+    """Where the meshes come from."""
+    split: str = "train"
+    """Split: train, val, or a name of your own."""
+    up: Literal["auto", "x", "y", "z"] = "auto"
+    """Axis that points up in the files (auto: what the format states or is used to)."""
+    workers: int = 2
+    """Processes."""
+    time_limit: float = 300.0
+    """Seconds after which one file is given up."""
+    report: Path | None = None
+    """JSON report to write (default: import-SPLIT.json in the cache)."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +116,7 @@ class Verify:
 
 Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
@@ -94,10 +129,16 @@ def main(arguments: list[str] | None = None) -> None:
         Command,
         args=arguments,
         prog="tslam-bench assets",
-        description="Prepare, list, show and verify the benchmark's objects.",
+        description="Prepare, import, list, show and verify the benchmark's objects.",
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    handlers: dict[type, Callable[[Any], None]] = {Prepare: _prepare, List: _list, Show: _show, Verify: _verify}
+    handlers: dict[type, Callable[[Any], None]] = {
+        Prepare: _prepare,
+        Import: _import,
+        List: _list,
+        Show: _show,
+        Verify: _verify,
+    }
     try:
         handlers[type(command)](command)
     except BenchmarkError as error:
@@ -105,35 +146,93 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
 
 
-def _sources(command: Prepare) -> tuple[list[Any], int | None]:
-    """What to prepare, and how many of it (None: all)."""
+def _check_workers(workers: int, time_limit: float) -> None:
+    if workers < 1:
+        raise InvalidInputError(f"--workers {workers}: must be at least 1")
+    if not time_limit > 0:
+        raise InvalidInputError(f"--time-limit {time_limit}: must be above 0")
+
+
+def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
+    """Split, what to prepare of it, and how many of that (None: all)."""
     from tslam_bench.assets.prepare import ContactDBSource
 
+    _check_workers(command.workers, command.time_limit)
+    if command.manifest is not None:
+        from tslam_bench.assets.importer import read_set
+
+        split, own = read_set(command.manifest)
+        unknown = [name for name in command.objects if name not in {source.name for source in own}]
+        if unknown:
+            raise InvalidInputError(f"object {unknown[0]!r}: not in {command.manifest}")
+        return split, [source for source in own if not command.objects or source.name in command.objects], None
     split = store.SPLIT_ALIASES.get(command.split, command.split)
     if split not in store.SPLITS:
-        raise InvalidInputError(f"split {command.split!r}: unknown; choose one of {', '.join(store.SPLITS)}")
-    if command.workers < 1:
-        raise InvalidInputError(f"--workers {command.workers}: must be at least 1")
+        raise InvalidInputError(
+            f"split {command.split!r}: unknown; choose one of {', '.join(store.SPLITS)}, or use --manifest or import"
+        )
     if command.count is not None and command.count < 1:
         raise InvalidInputError(f"--count {command.count}: must be at least 1")
     if split == "test":
-        if command.source is not None or command.count is not None:
-            raise InvalidInputError(
-                "--source and --count: the test split is fixed; use --objects NAME ... for a part of it"
-            )
+        if command.source != "all" or command.count is not None:
+            raise InvalidInputError("--source, --count: the test split is fixed; --objects NAME ... takes a part of it")
         names = command.objects or (QUICK_OBJECTS if command.quick else tuple(contactdb.OBJECTS))
         resolved = dict.fromkeys(store.resolve_name(name, "test") for name in names)
-        return [ContactDBSource(name) for name in resolved], None
-    from tslam_bench.assets import generate
-
-    candidates = generate.candidates(split)
+        return split, [ContactDBSource(name) for name in resolved], None
+    generated, real = _training_sources(command, split)
     if command.objects:
-        by_name = {source.name: source for source in candidates}
+        by_name = {source.name: source for source in [*generated, *real]}
         unknown = [name for name in command.objects if name not in by_name]
         if unknown:
-            raise InvalidInputError(f"object {unknown[0]!r}: no generated object of split {split} has this name")
-        return [by_name[name] for name in command.objects], None
-    return candidates, command.count or QUICK_GENERATED[split]
+            raise InvalidInputError(f"object {unknown[0]!r}: not in split {split} (source: {command.source})")
+        return split, [by_name[name] for name in command.objects], None
+    if command.quick:
+        return split, generated, command.count or QUICK_GENERATED[split]
+    if command.source == "generated":
+        return split, generated, command.count or FULL_GENERATED[split]
+    return split, [*real, *generated], command.count
+
+
+def _training_sources(command: Prepare, split: str) -> tuple[list[Any], list[Any]]:
+    """Generated and real sources of train or val."""
+    from tslam_bench.assets import furniture, generate
+
+    generated: list[Any] = []
+    real: list[Any] = []
+    only_generated = command.quick or command.source == "generated"
+    if command.source != "furniture":
+        generated = list(generate.candidates(split, rounds=200 if only_generated or command.objects else ADDED_ROUNDS))
+    if not only_generated and not _all_known(command.objects, generated):
+        real = list(furniture.furniture(split, cache_directory()))
+    return generated, real
+
+
+def _all_known(names: tuple[str, ...], sources: list[Any]) -> bool:
+    """Whether there are names and all of them are among ``sources``: then nothing else has to be fetched."""
+    return bool(names) and set(names) <= {source.name for source in sources}
+
+
+def _show_progress(
+    title: str, items: Sequence[Any], count: int | None, workers: int, time_limit: float
+) -> tuple[dict[str, int], list[Any]]:
+    """Prepares with a progress bar and a line per object; returns how many of each status, and all outcomes."""
+    from tslam_bench.assets.prepare import prepare
+
+    tally: dict[str, int] = {}
+    outcomes = []
+    with tqdm(total=count or len(items), unit="object", desc=title, dynamic_ncols=True) as bar:
+        for outcome in prepare(items, count=count, workers=workers, time_limit=time_limit):
+            outcomes.append(outcome)
+            tally[outcome.status] = tally.get(outcome.status, 0) + 1
+            if count is None or outcome.record is not None:
+                bar.update()
+            if outcome.record is None:
+                bar.write(f"{outcome.name}: {outcome.status}: {outcome.message}")
+            elif outcome.status == "prepared":
+                why = f" (rebuilt: {outcome.message})" if outcome.message else ""
+                iou = outcome.record["gates"]["hull_iou"]
+                bar.write(f"{outcome.name}: {outcome.record['hull_count']} hulls, hull IoU {iou:.3f}{why}")
+    return tally, outcomes
 
 
 def _prepare_hand(again: bool) -> None:
@@ -152,41 +251,52 @@ def _prepare_hand(again: bool) -> None:
 
 
 def _prepare(command: Prepare) -> None:
-    from tslam_bench.assets.prepare import prepare, write_manifest
+    from tslam_bench.assets.furniture import write_attributions
+    from tslam_bench.assets.prepare import write_manifest
 
     if command.hand:
         _prepare_hand(again=True)
         return
     started = time.monotonic()
-    split = store.SPLIT_ALIASES.get(command.split, command.split)
-    items, count = _sources(command)
-    tally: dict[str, int] = {}
-    failures = []
-    with tqdm(total=count or len(items), unit="object", desc=f"preparing {split}", dynamic_ncols=True) as bar:
-        for outcome in prepare(items, count=count, workers=command.workers):
-            tally[outcome.status] = tally.get(outcome.status, 0) + 1
-            if outcome.status in ("reused", "prepared"):
-                bar.update()
-            if outcome.status == "prepared":
-                gates = outcome.record["gates"] if outcome.record else {}
-                why = f" (rebuilt: {outcome.message})" if outcome.message else ""
-                bar.write(
-                    f"{outcome.name}: {outcome.record['hull_count']} hulls, hull IoU {gates['hull_iou']:.3f}{why}"
-                )
-            elif outcome.status in ("rejected", "failed"):
-                bar.write(outcome.message)
-                failures += [outcome.message] if outcome.status == "failed" else []
+    split, items, count = _sources(command)
+    tally, outcomes = _show_progress(f"preparing {split}", items, count, command.workers, command.time_limit)
     if split == "test":
         _prepare_hand(again=False)
+    else:
+        write_attributions(store.list_objects(split), cache_directory() / f"attributions-{split}.json")
     path = write_manifest(split)
-    if command.manifest is not None:
-        write_manifest(split, command.manifest)
+    if command.write_manifest is not None:
+        write_manifest(split, command.write_manifest)
     summary = ", ".join(f"{number} {status}" for status, number in tally.items())
     print(f"{summary}; {time.monotonic() - started:.0f} s; manifest: {path}")
-    if failures:
-        raise AssetError(f"{len(failures)} of {len(items)} objects failed; first: {failures[0]}")
-    if count is not None and tally.get("reused", 0) + tally.get("prepared", 0) < count:
-        raise AssetError(f"split {split}: only part of the {count} objects could be made")
+    _complain(split, outcomes, count, strict=split == "test" or command.manifest is not None or bool(command.objects))
+
+
+def _complain(split: str, outcomes: list[Any], count: int | None, strict: bool) -> None:
+    """Raises AssetError if less was prepared than was asked for: with ``strict`` every object has to be."""
+    ready = sum(outcome.record is not None for outcome in outcomes)
+    lost = [outcome for outcome in outcomes if outcome.record is None]
+    if lost and (strict or not ready):
+        raise AssetError(f"{len(lost)} of {len(outcomes)} objects could not be prepared; first: {lost[0].message}")
+    if count is not None and ready < count:
+        raise AssetError(f"split {split}: only {ready} of the {count} objects could be made")
+
+
+def _import(command: Import) -> None:
+    from tslam_bench.assets.importer import report, scan
+    from tslam_bench.assets.prepare import write_manifest
+
+    _check_workers(command.workers, command.time_limit)
+    sources = scan(command.folder, command.split, command.license, command.source, command.up)
+    _, outcomes = _show_progress(f"importing into {command.split}", sources, None, command.workers, command.time_limit)
+    path = command.report or cache_directory() / f"import-{command.split}.json"
+    summary = report(outcomes, sources)
+    write_json(path, summary)
+    if any(outcome.record is not None for outcome in outcomes):
+        write_manifest(command.split)
+    print(f"{', '.join(f'{number} {status}' for status, number in summary['counts'].items())}; report: {path}")
+    if all(outcome.record is None for outcome in outcomes):
+        raise AssetError(f"{command.folder}: no mesh could be imported; the reasons are in {path}")
 
 
 def _list(command: List) -> None:

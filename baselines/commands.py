@@ -121,8 +121,11 @@ def _evaluate(arguments: list[str]) -> None:
 
     parsed = tyro.cli(EvaluateArguments, args=arguments, prog="tslam-bench baselines evaluate")
     spec = get_baseline(parsed.baseline)
+    import torch
+
     from tslam_bench.baselines.evaluate import EvaluationConfig, default_objects, evaluate, make_reconstructors
 
+    torch.set_num_threads(1)  # one observation at a time: more threads only wait for each other
     config = EvaluationConfig(
         baseline=spec.id,
         objects=parsed.objects or default_objects(parsed.object_set),
@@ -138,10 +141,10 @@ def _evaluate(arguments: list[str]) -> None:
         if stage not in bars:
             bars[stage] = tqdm(total=total, desc=f"{spec.id}: {stage}", mininterval=1.0)
         _to(bars[stage], done)
+        if done == total:
+            bars[stage].close()
 
     submissions = evaluate(config, make_reconstructors(parsed.reconstructors), parsed.output, show)
-    for bar in bars.values():
-        bar.close()
     for submission in submissions:
         print(submission)
 

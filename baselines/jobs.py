@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Any, Final
 
 from tslam_bench import __version__
 from tslam_bench.errors import BenchmarkError, InvalidInputError
@@ -44,6 +44,7 @@ class Job:
         outputs: paths that it leaves; if one is gone it is run again.
         slots: processes that it keeps busy.
         always: run it even if it was done before.
+        fingerprint: called after the job; what it returns must be the same whenever the folder is used again.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Job:
     outputs: tuple[Path, ...] = ()
     slots: int = 1
     always: bool = False
+    fingerprint: Callable[[], str] | None = None
 
 
 @dataclass
@@ -135,12 +137,16 @@ class JobRunner:
     def _is_done(self, job: Job) -> bool:
         if job.always:
             return False
-        path = self.logs / f"{job.name}.json"
+        stored = self._stored(job).get("stamp")
+        return stored == self._stamps[job.name] and all(output.exists() for output in job.outputs)
+
+    def _stored(self, job: Job) -> dict[str, Any]:
+        """The stamp of an earlier run; empty if there is none."""
         try:
-            stamp = json.loads(path.read_text(encoding="utf-8"))["stamp"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
-        return stamp == self._stamps[job.name] and all(output.exists() for output in job.outputs)
+            stamp = json.loads((self.logs / f"{job.name}.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return stamp if isinstance(stamp, dict) else {}
 
     def _start(self, job: Job, lock: int | None) -> _Running:
         self._say(f"$ {shlex.join(job.command)}")
@@ -164,9 +170,18 @@ class JobRunner:
         code = current.process.returncode
         missing = [output for output in current.job.outputs if not output.exists()]
         if code == 0 and not missing:
+            fingerprint = current.job.fingerprint() if current.job.fingerprint else None
+            command = shlex.join(current.job.command)
+            stored = self._stored(current.job)
+            if stored.get("command") == command and stored.get("fingerprint") != fingerprint:
+                raise InvalidInputError(
+                    f"{self.logs.parent}: was made with other products of {current.job.name}; "
+                    "delete it or choose another folder"
+                )
             stamp = {
                 "stamp": self._stamps[current.job.name],
-                "command": shlex.join(current.job.command),
+                "command": command,
+                "fingerprint": fingerprint,
                 "seconds": round(time.monotonic() - current.started, 1),
             }
             write_json(self.logs / f"{current.job.name}.json", stamp)

@@ -18,6 +18,7 @@ from typing import Final, Literal
 import tyro
 from tqdm import tqdm
 
+from tslam_bench.assets.store import asset_sha256, known_names
 from tslam_bench.baselines.jobs import Job, JobRunner
 from tslam_bench.baselines.registry import get_baseline, list_baselines
 from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
@@ -209,7 +210,12 @@ def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
     prepare: Command = ("tslam-bench", "assets", "prepare")
     several: Command = ("--workers", str(workers))
     test_objects = ("--quick",) if settings.objects == QUICK_OBJECTS else _objects(settings)
-    jobs = [Job(_TEST_ASSETS, (*prepare, *test_objects, *several), slots=workers, always=True)]
+
+    def test_assets() -> str:
+        return asset_sha256(settings.objects or known_names("test"))
+
+    command = (*prepare, *test_objects, *several)
+    jobs = [Job(_TEST_ASSETS, command, slots=workers, always=True, fingerprint=test_assets)]
     for split, arguments in settings.learning_objects:
         command = (*prepare, "--split", split, *arguments, *several)
         jobs.append(Job(f"assets-{split}", command, slots=workers, always=True))

@@ -28,12 +28,13 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import tslam_bench
+from tslam_bench.assets.store import asset_sha256, list_objects
 from tslam_bench.baselines.network import NETWORKS, policy_arguments
 from tslam_bench.baselines.registry import get_baseline
 from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE, PAPER_STEPS, TrainingConfig
 from tslam_bench.baselines.vector import TactileVecEnv
 from tslam_bench.constants import ENVIRONMENT_ID
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_directory, atomic_file, ensure_writable_directory, write_json
 from tslam_bench.hand_constants import JOINT_LIMITS
 
@@ -68,12 +69,15 @@ def train(
         metadata = json.loads(metadata_path.read_text(encoding="utf-8"))
         _check_same_settings(config, metadata["config"], output)
         return metadata
+    assets = _assets(config)
     ensure_writable_directory(output)
     torch.set_num_threads(config.torch_threads)
     checkpoint = _last_checkpoint(output)
     state = json.loads((checkpoint / CHECKPOINT_STATE).read_text(encoding="utf-8")) if checkpoint else None
     if state is not None:
         _check_same_settings(config, state["config"], output)
+        if state["assets"] != assets:
+            raise InvalidInputError(f"{output}: was begun with other objects; delete it or choose another output")
 
     environments = make_training_environments(config)
     normalised = VecNormalize(
@@ -104,7 +108,7 @@ def train(
                 mean_return = float(np.mean([episode["r"] for episode in model.ep_info_buffer]))
             if model.num_timesteps < config.total_steps:
                 seconds = seconds_before + time.perf_counter() - start
-                _save_checkpoint(model, normalised, config, output, seconds, mean_return)
+                _save_checkpoint(model, normalised, config, assets, output, seconds, mean_return)
         seconds = seconds_before + time.perf_counter() - start
     finally:
         normalised.close()
@@ -115,6 +119,7 @@ def train(
         "reward_mode": spec.reward_mode,
         "privileged": spec.privileged,
         "config": _plain(config),
+        "assets": assets,
         "steps": model.num_timesteps,
         "paper_steps": PAPER_STEPS,
         "seed": config.seed,
@@ -199,6 +204,7 @@ def _save_checkpoint(
     model: PPO,
     normalised: VecNormalize,
     config: TrainingConfig,
+    assets: dict[str, Any],
     output: Path,
     seconds: float,
     mean_return: float | None,
@@ -209,6 +215,7 @@ def _save_checkpoint(
         model.save(temporary / MODEL_FILE)
         state = {
             "config": _plain(config),
+            "assets": assets,
             "steps": model.num_timesteps,
             "return_mean": float(normalised.ret_rms.mean),
             "return_variance": float(normalised.ret_rms.var),
@@ -227,6 +234,15 @@ def _last_checkpoint(output: Path) -> Path | None:
     folder = output / "checkpoints"
     complete = sorted(path for path in folder.iterdir() if path.name.isdigit()) if folder.is_dir() else []
     return complete[-1] if complete else None
+
+
+def _assets(config: TrainingConfig) -> dict[str, Any]:
+    """What is trained on: number and hash of the objects."""
+    names = config.objects or tuple(record["name"] for record in list_objects(config.split))
+    if not names:
+        command = f"tslam-bench assets prepare --split {config.split}"
+        raise AssetError(f"split {config.split!r}: no object is prepared; run '{command}'")
+    return {"objects": len(names), "sha256": asset_sha256(names, config.split)}
 
 
 def _plain(config: TrainingConfig) -> dict[str, Any]:

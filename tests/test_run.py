@@ -147,6 +147,18 @@ def test_missing_output_is_made_again(tmp_path: Path) -> None:
         runner(tmp_path).run([lazy])
 
 
+def test_results_of_other_products_are_not_mixed(tmp_path: Path) -> None:
+    products = ["first"]
+    job = Job("assets", python("pass"), always=True, fingerprint=lambda: products[0])
+    after = Job("use", appending(tmp_path / "trace", "x"), after=("assets",))
+    runner(tmp_path).run([job, after])
+    runner(tmp_path).run([job, after])
+    products[0] = "second"
+    with pytest.raises(InvalidInputError, match="made with other products of assets; delete it"):
+        runner(tmp_path).run([job, after])
+    assert (tmp_path / "trace").read_text() == "x "
+
+
 def test_failure_names_job_reason_and_log_and_stops_the_others(tmp_path: Path) -> None:
     slow = Job("slow", python("import time; time.sleep(60)"))
     bad = Job("bad", python("import sys; print('first'); print('the reason'); sys.exit(3)"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tslam_bench.baselines import training
+from tslam_bench.baselines.evaluate import EvaluationConfig, evaluate, make_reconstructors
 from tslam_bench.baselines.learned import read_policy
 from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.training import train
@@ -24,6 +26,7 @@ from tslam_bench.baselines.training_config import MODEL_FILE, TrainingConfig
 from tslam_bench.baselines.vector import TactileVecEnv
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import CACHE_VARIABLE
+from tslam_bench.leaderboard.submission import read_submission
 
 CONFIG = TrainingConfig(
     baseline="tslam",
@@ -60,6 +63,7 @@ def weights(output: Path) -> list[torch.Tensor]:
 def test_finished_run_holds_what_it_promises(straight: Path) -> None:
     metadata = json.loads((straight / "model.json").read_text())
     assert metadata["steps"] == 120 and metadata["baseline"] == "tslam" and metadata["reward_mode"] == "tslam"
+    assert metadata["assets"]["objects"] == 2 and len(metadata["assets"]["sha256"]) == 64
     assert metadata["command"] == "the command" and metadata["seconds"] > 0 and metadata["machine"]["cores"] >= 1
     assert not (straight / "checkpoints").exists()
     events = EventAccumulator(str(straight / "tensorboard"))
@@ -67,6 +71,19 @@ def test_finished_run_holds_what_it_promises(straight: Path) -> None:
     assert [event.step for event in events.Scalars("time/fps")] == [40, 80, 120]
     baseline = make_baseline("tslam", straight)
     baseline.reset(1, 0)
+
+
+def test_submission_of_a_trained_model_states_its_budget(straight: Path, tmp_path: Path) -> None:
+    config = EvaluationConfig("tslam", ("phone",), object_set="quick", model=straight)
+    (path,) = evaluate(config, make_reconstructors(("grid",)), tmp_path)
+    info = read_submission(path).info
+    assert info.training.steps == 120 and info.training.wall_time_hours > 0 and "cores" in info.training.hardware
+    assert (info.explorer, info.reward_mode, info.privileged) == ("tslam", "tslam", False)
+    other = tmp_path / "other"
+    shutil.copytree(straight, other)
+    (other / MODEL_FILE).write_bytes((straight / MODEL_FILE).read_bytes() + b" ")
+    with pytest.raises(InvalidInputError, match="episodes of another model"):
+        evaluate(replace(config, model=other), make_reconstructors(("grid",)), tmp_path)
 
 
 def test_policy_read_without_pickle_is_the_saved_one(straight: Path) -> None:
@@ -98,6 +115,31 @@ def test_killed_and_resumed_run_ends_with_the_same_weights(straight: Path, tmp_p
     assert metadata["steps"] == 120
     for straight_weight, resumed_weight in zip(weights(straight), weights(tmp_path), strict=True):
         assert torch.equal(straight_weight, resumed_weight)
+
+
+def test_checkpoint_of_other_objects_is_refused(tmp_path: Path, cache: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(done: int) -> None:
+        if done > 40:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(CONFIG, tmp_path, on_progress=kill)
+    moved = cache / "objects" / "plate"
+    (cache / "objects" / "train" / "plate").rename(moved)
+    try:
+        with pytest.raises(InvalidInputError, match="begun with other objects"):
+            train(CONFIG, tmp_path)
+    finally:
+        moved.rename(cache / "objects" / "train" / "plate")
+
+
+def test_split_that_is_not_prepared(tmp_path: Path) -> None:
+    with pytest.raises(AssetError, match=r"no object is prepared; run 'tslam-bench assets prepare --split val'"):
+        train(replace(CONFIG, split="val"), tmp_path / "model")
+    assert not (tmp_path / "model").exists()
 
 
 def test_finished_model_is_not_trained_again(straight: Path, monkeypatch) -> None:

@@ -8,6 +8,7 @@ python docs/measure_reconstruction.py rollouts --folder runs/quick/rollouts --sp
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,7 @@ from tslam_bench.constants import (
     VOXEL_EDGE,
     WORKSPACE_LOW,
 )
+from tslam_bench.errors import BenchmarkError
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import make_reconstructor
@@ -165,6 +167,15 @@ def rollouts(command: Rollouts) -> None:
 def main() -> None:
     """Command line."""
     command = tyro.cli(Command, description=__doc__)
+    try:
+        run(command)
+    except BenchmarkError as error:
+        print(f"measure_reconstruction: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def run(command: Hull | Simulated | Rollouts) -> None:
+    """Runs one subcommand."""
     if isinstance(command, Simulated):
         simulated(command)
     elif isinstance(command, Rollouts):

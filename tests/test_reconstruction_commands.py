@@ -144,6 +144,9 @@ def test_train_then_run(command, touches, tmp_path):
         (["train", "--output", "m.pt", "--split", "test"], "learn from train or val"),
         (["train", "--output", "m.pt", "--split", "val"], "no object is prepared"),
         (["train", "--output", "m.pt", "--count", "5"], "has 2 prepared objects"),
+        (["train", "--output", "m.pt", "--objects", "boxx"], "unknown in split train (did you mean box?)"),
+        (["train", "--output", "m.pt", "--objects", "box", "--count", "1"], "count and objects: give one of them"),
+        (["train", "--output", "m.pt", "--threshold-objects", "box"], "split 'val': no object is prepared"),
         (["train", "--output", "m.pt", "--steps", "0"], "steps 0: choose at least 1"),
         (
             ["train", "--output", "m.pt", "--architecture", "convonet", "--size", "paper"],
@@ -190,11 +193,12 @@ def test_floors_are_built_from_the_training_split(cache, touches):
 
 def test_training_shapes_come_from_the_prepared_objects(cache):
     assert training_names("train", cache=cache) == ["box", "plate"]
-    assert training_names("train", 1, cache) == ["box"]
-    shapes = load_training_shapes("train", cache=cache)
+    assert training_names("train", 1, cache=cache) == ["box"]
+    assert training_names("train", objects=("plate", "box", "plate"), cache=cache) == ["box", "plate"]
+    shapes = load_training_shapes(["box", "plate"], "train", cache=cache)
     assert [shape.name for shape in shapes] == ["box", "plate"]
     assert np.allclose(shapes[0].half_extents, [0.05, 0.04, 0.03])
-    again = load_training_shapes("train", cache=cache)
+    again = load_training_shapes(["box", "plate"], "train", cache=cache)
     assert np.array_equal(shapes[1].near_points, again[1].near_points)
 
 

@@ -55,8 +55,12 @@ class TrainArguments:
     """Split to learn from."""
     count: int | None = None
     """Learn from this many of its prepared objects, the first by name; all of them if not given."""
+    objects: tuple[str, ...] = ()
+    """Learn from these of its prepared objects."""
     threshold_split: str = "val"
     """Split whose prepared objects fix the threshold; if none is prepared, the training objects do."""
+    threshold_objects: tuple[str, ...] = ()
+    """Fix the threshold on these of its prepared objects; all of them if not given."""
     log: Path | None = None
     """Directory of a TensorBoard log."""
 
@@ -120,18 +124,20 @@ def _train(arguments: list[str]) -> None:
     config = parsed.config
     config.check()
     network_config(config.architecture, config.size)
-    names = training_names(parsed.split, parsed.count)
+    names = training_names(parsed.split, parsed.count, parsed.objects)
     try:
-        held_out = training_names(parsed.threshold_split)
+        held_out = training_names(parsed.threshold_split, None, parsed.threshold_objects)
     except AssetError:
+        if parsed.threshold_objects:
+            raise
         held_out = []
     with tqdm(total=len(names) + len(held_out), unit="object", desc="sample objects", mininterval=1.0) as bar:
-        shapes = load_training_shapes(parsed.split, parsed.count, config.seed, progress=lambda done, _: bar.update())
-        threshold_shapes = None
-        if held_out:
-            threshold_shapes = load_training_shapes(
-                parsed.threshold_split, None, config.seed, progress=lambda done, _: bar.update()
-            )
+
+        def advance(done: int, total: int) -> None:
+            bar.update()
+
+        shapes = load_training_shapes(names, parsed.split, config.seed, progress=advance)
+        threshold_shapes = load_training_shapes(held_out, parsed.threshold_split, config.seed, progress=advance) or None
 
     with tqdm(total=config.steps, unit="step", desc=f"train {config.architecture}", mininterval=1.0) as bar:
 

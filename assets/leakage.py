@@ -11,6 +11,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,7 +185,7 @@ def references(wheel: Path, cache: Path) -> list[Shape]:
     path = cache / "leakage" / f"references-{key}.npz"
     names = list(contactdb.OBJECTS)
     if not path.exists():
-        arrays = {}
+        arrays: dict[str, Any] = {}
         for name in names:
             mesh = parse_stl(contactdb.read_mesh_file(name, wheel))
             if name in FILLED:

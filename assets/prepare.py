@@ -169,11 +169,14 @@ def prepare(
 
 def _prepare_shared(item: Any, cache: Path) -> None:
     """Fetches what several workers need, once, before they start."""
-    wheel = fetch(sources.CONTACTDB_WHEEL, cache)
-    if item.split != "test":
-        from tslam_bench.assets.leakage import references
+    from tslam_bench.assets.pipeline import LEAKAGE_SPLITS
 
-        references(wheel, cache)
+    if item.split == "test" or item.split in LEAKAGE_SPLITS:
+        wheel = fetch(sources.CONTACTDB_WHEEL, cache)
+        if item.split in LEAKAGE_SPLITS:
+            from tslam_bench.assets.leakage import references
+
+            references(wheel, cache)
 
 
 def _remove_stale(cache: Path) -> None:

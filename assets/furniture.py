@@ -220,6 +220,11 @@ def _entries(path: Path) -> dict[int, dict[str, str]]:
     return entries
 
 
+def categories() -> list[str]:
+    """All categories, in the order in which names are tried."""
+    return [category for category, _ in _CATEGORIES]
+
+
 def category_of(title: str) -> str | None:
     """Category of a model by its name; None if it is left out."""
     lowered = title.lower()

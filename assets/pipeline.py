@@ -25,6 +25,12 @@ PIPELINE_VERSION = 4
 """Bumped when the same source gives other products."""
 MIN_HULL_IOU = 0.85
 """Gate: IoU(hull union, ground truth) below this needs an explicit exception."""
+HULL_IOU_EXCEPTIONS = {
+    "test/wineglass": (
+        "Its wall is 2.3 mm thick and curved both ways: even 128 convex pieces, flat on the inside, add a sixth to its volume."
+    ),
+}
+"""Objects that are in although their hulls miss the gate: split/name -> reason."""
 LEAKAGE_SPLITS = ("train", "val")
 """Splits that no copy of a test object may enter."""
 MIN_KEPT_SHARE = 0.95

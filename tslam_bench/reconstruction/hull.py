@@ -50,7 +50,7 @@ class HullReconstructor:
 
     Args:
         resolution: cells per axis of the volume. An odd multiple of 32 puts a sample on every voxel centre, hence on
-            every corner of the hull: at 96 the volume and the exact hull agree to IoU 0.999 or better.
+            every corner of the hull: at 96 the volume and the exact hull agree to IoU 0.999 from 20 random touches on.
 
     Raises:
         InvalidInputError: the resolution is not in 2..512.

@@ -17,7 +17,7 @@ import gymnasium
 import tyro
 
 import tslam_bench  # noqa: F401  (registers the environment)
-from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.constants import ENVIRONMENT_ID, TABLETOP_ID
 from tslam_bench.files import atomic_file
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.tasks.commands import action_rows, environment_rows, observation_rows, reward_rows
@@ -52,6 +52,9 @@ def page() -> str:
     manual = inspect.cleandoc(type(environment.unwrapped).__doc__ or "")
     observations = observation_rows(environment)
     environment.close()
+    tabletop = gymnasium.make(TABLETOP_ID, object="mug")
+    tabletop_manual = inspect.cleandoc(type(tabletop.unwrapped).__doc__ or "")
+    tabletop.close()
     parts = [
         "# Environment",
         "<!-- Written by docs/build_environment.py: change the code, not this page. -->",
@@ -59,6 +62,8 @@ def page() -> str:
         table(environment_rows()),
         f"## `{ENVIRONMENT_ID}`",
         f"```text\n{manual}\n```",
+        f"## `{TABLETOP_ID}`",
+        f"```text\n{tabletop_manual}\n```",
         "## Observations",
         "Per environment; every value is batched `(num_envs, ...)`. `touch` follows the order of the skin links: "
         + ", ".join(f"`{name}`" for name in SKIN_LINKS)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.assets.hand import load_hand
-from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, REWARD_MODES
+from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, HORIZON, NUM_JOINTS, REWARD_MODES
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES, SKIN_LINKS
 from tslam_bench.tasks.arrays import NumpyBackend
@@ -20,6 +20,7 @@ from tslam_bench.tasks.rewards import Rewards
 from tslam_bench.tasks.sensing import TactileSensing
 from tslam_bench.tasks.skin import build_skin
 from tslam_bench.tasks.starts import StartSampler
+from tslam_bench.variants import get_variant
 
 OBSERVATION_ARRAYS: dict[str, tuple[tuple[int, ...], type]] = {
     "qpos": ((NUM_JOINTS,), np.float32),
@@ -57,6 +58,7 @@ class BatchSettings:
     pose: int | None = None
     reward_mode: str = "tslam"
     control_mode: str = CONTROL_MODES[0]
+    environment_id: str = ENVIRONMENT_ID
 
     def __post_init__(self) -> None:
         known = (*REWARD_MODES, "none")
@@ -69,7 +71,7 @@ class BatchSettings:
 
     def sampler(self) -> StartSampler:
         """Draws episode starts. Raises what :class:`StartSampler` raises."""
-        return StartSampler(self.object, self.objects, self.split, self.pose)
+        return StartSampler(self.object, self.objects, self.split, self.pose, get_variant(self.environment_id))
 
 
 class HandBatch:
@@ -87,7 +89,8 @@ class HandBatch:
         self.num_envs = num_envs
         self._arrays = arrays
         self._starts = settings.sampler()
-        self._scenes = [HandScene(hand.urdf, bodies) for _ in range(num_envs)]
+        table = self._starts.variant.table
+        self._scenes = [HandScene(hand.urdf, bodies, table) for _ in range(num_envs)]
         self._sensing = TactileSensing(num_envs, build_skin(hand.shapes), backend)
         self._targets = DriveTargets(settings.control_mode, backend)
         self._rewards = Rewards(settings.reward_mode, num_envs, backend) if settings.reward_mode != "none" else None

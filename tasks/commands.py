@@ -22,7 +22,7 @@ from tslam_bench.constants import (
 )
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT, JOINT_LIMITS, JOINT_NAMES
-from tslam_bench.registration import ENVIRONMENT_IDS
+from tslam_bench.variants import VARIANTS, get_variant
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,12 @@ class Describe:
 class Video:
     """Record one episode of a registered explorer as an animated picture (needs a Vulkan device)."""
 
+    environment: str = ENVIRONMENT_ID
+    """Environment id."""
     object: str = "mug"
     """Object of the test split."""
     pose: int = 0
-    """Pose, 0..7."""
+    """Pose, one of the environment's."""
     baseline: str = "heuristic"
     """A scripted explorer (tslam-bench baselines list)."""
     seed: int = 0
@@ -86,8 +88,15 @@ def main(arguments: Sequence[str]) -> None:
 def environment_rows() -> list[dict[str, Any]]:
     """One record per registered environment id."""
     return [
-        {"id": name, "horizon": HORIZON, "seconds": round(HORIZON * CONTROL_STEP_SECONDS, 2), "actions": NUM_JOINTS}
-        for name in ENVIRONMENT_IDS
+        {
+            "id": variant.id,
+            "summary": variant.summary,
+            "poses": len(variant.poses),
+            "horizon": HORIZON,
+            "seconds": round(HORIZON * CONTROL_STEP_SECONDS, 2),
+            "actions": NUM_JOINTS,
+        }
+        for variant in VARIANTS.values()
     ]
 
 
@@ -146,9 +155,7 @@ def _list(command: List) -> None:
 def _describe(command: Describe) -> None:
     import gymnasium
 
-    if command.environment not in ENVIRONMENT_IDS:
-        raise InvalidInputError(f"environment {command.environment!r}: unknown; one of {', '.join(ENVIRONMENT_IDS)}")
-    environment = gymnasium.make(command.environment, object=command.object)
+    environment = gymnasium.make(get_variant(command.environment).id, object=command.object)
     tables = {
         "observations": observation_rows(environment),
         "actions": action_rows(),
@@ -171,6 +178,7 @@ def _video(command: Video) -> None:
     from tslam_bench.files import atomic_file
     from tslam_bench.tasks.rendering import vulkan_device_available
 
+    variant = get_variant(command.environment)
     if command.output.suffix not in (".webp", ".gif"):
         raise InvalidInputError(f"{command.output}: unknown kind of video; end the name in .webp or .gif")
     if not vulkan_device_available():
@@ -180,7 +188,7 @@ def _video(command: Video) -> None:
     from tslam_bench.baselines.registry import make_baseline  # a command may use what the library must not
 
     explorer = make_baseline(command.baseline)
-    environment = gymnasium.make(ENVIRONMENT_ID, object=command.object, pose=command.pose, render_mode="rgb_array")
+    environment = gymnasium.make(variant.id, object=command.object, pose=command.pose, render_mode="rgb_array")
     observation, _ = environment.reset(seed=command.seed)
     explorer.reset(1, command.seed)
     frames = []

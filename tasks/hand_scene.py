@@ -64,10 +64,12 @@ class HandScene:
     Args:
         urdf: the converted hand.
         bodies: where object bodies come from.
+        table: whether the object stands on a table.
     """
 
-    def __init__(self, urdf: Path, bodies: BodyPool) -> None:
+    def __init__(self, urdf: Path, bodies: BodyPool, table: bool = False) -> None:
         physics.configure()
+        self._table = physics.table_entity("table", can_render=False) if table else None
         self._bodies = bodies
         self._body: sapien.Entity | None = None
         self._scene = sapien.Scene([physx.PhysxCpuSystem()])
@@ -103,6 +105,9 @@ class HandScene:
             self._scene.add_entity(entity)
         self._body.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(start.pose))
         self._scene.add_entity(self._body)
+        if self._table is not None:
+            self._table.pose = physics.table_pose(start.prepared)
+            self._scene.add_entity(self._table)
         qpos = start.qpos[self._from_order]
         self._robot.set_root_pose(sapien.Pose(BASE_POSITION, BASE_QUATERNION))
         self._robot.set_qpos(qpos)

@@ -11,6 +11,7 @@ from sapien import physx
 
 from tslam_bench import grids
 from tslam_bench.assets.store import PreparedObject
+from tslam_bench.constants import TABLE_SIZE
 from tslam_bench.errors import AssetError
 
 SOLVER_POSITION_ITERATIONS: Final = 4
@@ -102,6 +103,29 @@ def object_entity(prepared: PreparedObject, name: str, shapes: Sequence[Any], ca
         entity.add_component(_looks(prepared))
     entity.add_component(body)
     return entity
+
+
+def table_entity(name: str, can_render: bool) -> sapien.Entity:
+    """The tabletop variant's table: a fixed box."""
+    entity = sapien.Entity()
+    entity.name = name
+    body = physx.PhysxRigidDynamicComponent()
+    body.kinematic = True  # as the object: its height changes with the object between episodes
+    half = np.array(TABLE_SIZE, dtype=np.float32) / 2
+    material = physx.PhysxMaterial(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
+    body.attach(physx.PhysxCollisionShapeBox(half, material))
+    if can_render:
+        looks = sapien.render.RenderBodyComponent()
+        wood = sapien.render.RenderMaterial(base_color=[0.55, 0.47, 0.38, 1.0], roughness=0.8, specular=0.1)
+        looks.attach(sapien.render.RenderShapeBox(half, wood))
+        entity.add_component(looks)
+    entity.add_component(body)
+    return entity
+
+
+def table_pose(prepared: PreparedObject) -> sapien.Pose:
+    """Where the table stands: centred below the object, its top at the lowest point of the upright object (poses 0..3)."""
+    return sapien.Pose([0.0, 0.0, float(prepared.vertices[:, 2].min()) - TABLE_SIZE[2] / 2])
 
 
 def _looks(prepared: PreparedObject) -> Any:

@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench import grids
 from tslam_bench.assets.store import PreparedObject, list_objects, load_object
-from tslam_bench.constants import NUM_JOINTS, NUM_POSES
+from tslam_bench.constants import NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
     JOINT_LIMITS,
@@ -25,6 +24,7 @@ from tslam_bench.hand_constants import (
     START_CLEARANCE,
     START_FINGER_NOISE,
 )
+from tslam_bench.variants import FREE, Variant
 
 LOADED_OBJECTS: Final = 64
 """Objects kept in memory, about 10 MB each."""
@@ -55,6 +55,7 @@ class StartSampler:
         objects: names to draw from, or None for the whole split.
         split: split of the objects.
         pose: one pose for every episode, or None to draw.
+        variant: the environment; it says which poses there are.
 
     Raises:
         InvalidInputError: unknown object, split or pose, or nothing to draw from.
@@ -62,12 +63,18 @@ class StartSampler:
     """
 
     def __init__(
-        self, object: str | None, objects: Sequence[str] | None, split: str = "test", pose: int | None = None
+        self,
+        object: str | None,
+        objects: Sequence[str] | None,
+        split: str = "test",
+        pose: int | None = None,
+        variant: Variant = FREE,
     ) -> None:
         if object is not None and objects is not None:
             raise InvalidInputError("object and objects: give one or the other, not both")
         self.split = split
-        self._pose = None if pose is None else grids.check_pose(pose)
+        self.variant = variant
+        self._pose = None if pose is None else variant.check_pose(pose)
         self._load = lru_cache(maxsize=LOADED_OBJECTS)(partial(load_object, split=split))
         if object is not None:
             self.names: tuple[str, ...] = (self.load(object).name,)
@@ -98,9 +105,9 @@ class StartSampler:
     ) -> Start:
         """Draws an episode's start; ``name`` and ``pose`` override the draws, ``prepared`` is an object drawn before."""
         chosen = self.draw_object(rng, name) if prepared is None else prepared
-        drawn_pose = int(rng.uniform() * NUM_POSES)
+        drawn_pose = self.variant.poses[int(rng.uniform() * len(self.variant.poses))]
         if pose is not None:
-            drawn_pose = grids.check_pose(pose)
+            drawn_pose = self.variant.check_pose(pose)
         elif self._pose is not None:
             drawn_pose = self._pose
         uniform = rng.uniform(size=NUM_JOINTS)

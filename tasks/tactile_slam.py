@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import sapien
@@ -19,12 +19,10 @@ from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 from sapien import physx
 
-from tslam_bench import grids
 from tslam_bench.assets.hand import load_hand
 from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import (
     CONTROL_STEP_SECONDS,
-    ENVIRONMENT_ID,
     GRID_SIZE,
     HORIZON,
     NUM_JOINTS,
@@ -46,6 +44,7 @@ from tslam_bench.tasks.rewards import Rewards
 from tslam_bench.tasks.sensing import Contacts, TactileSensing
 from tslam_bench.tasks.skin import build_skin
 from tslam_bench.tasks.starts import StartSampler
+from tslam_bench.variants import FREE, TABLETOP, Variant
 
 
 class TactileSLAMEnv(BaseEnv):
@@ -93,6 +92,7 @@ class TactileSLAMEnv(BaseEnv):
     SUPPORTED_ROBOTS = ("adroit28",)
     SUPPORTED_OBS_MODES = ("state_dict", "state", "none", "sensor_data", "any_textures", "pointcloud")
     SUPPORTED_REWARD_MODES = (*REWARD_MODES, "none")
+    VARIANT: ClassVar[Variant] = FREE
     agent: AdroitHand
 
     def __init__(
@@ -125,11 +125,12 @@ class TactileSLAMEnv(BaseEnv):
                 f"num_envs {num_envs}, sim_backend {kwargs.get('sim_backend', 'auto')!r}: batched simulation needs a GPU and "
                 "there is none (CUDA); make environments with num_envs=1 instead"
             )
-        self._starts = StartSampler(object, objects, split, pose)
+        self._starts = StartSampler(object, objects, split, pose, self.VARIANT)
         self.split = split
         self.object_name: list[str] = [""] * num_envs
         self.pose: list[int] = [0] * num_envs
         self._bodies: dict[str, sapien.Entity] = {}
+        self._table: sapien.Entity | None = None
         self._contacts: Contacts | None = None
         if render_backend == "auto":
             wants_images = render_mode is not None or obs_mode not in ("state_dict", "state", "none")
@@ -204,6 +205,7 @@ class TactileSLAMEnv(BaseEnv):
         super()._setup_scene()
         self.scene.px.timestep = self.sim_timestep
         self._bodies = {}
+        self._table = None
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, AdroitHand.base_pose())
@@ -229,6 +231,10 @@ class TactileSLAMEnv(BaseEnv):
             self.scene.sub_scenes[env].add_entity(entity)
             self.object_name[env] = prepared.name
             entities.append(entity)
+            if self.VARIANT.table:
+                table = physics.table_entity(f"scene-{env}_table", self.scene.can_render())
+                table.pose = physics.table_pose(prepared)
+                self.scene.sub_scenes[env].add_entity(table)
         self._register_object(entities)
 
     def _register_object(self, entities: list[sapien.Entity]) -> None:
@@ -252,7 +258,7 @@ class TactileSLAMEnv(BaseEnv):
         for name in options.get("object", ()):
             self._starts.load(name)
         for pose in options.get("pose", ()):
-            grids.check_pose(pose)
+            self.VARIANT.check_pose(pose)
         return super().reset(seed=seed, options=options)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -309,7 +315,10 @@ class TactileSLAMEnv(BaseEnv):
             while len(self._bodies) >= physics.CACHED_BODIES:
                 del self._bodies[next(iter(self._bodies))]
             self._bodies[prepared.name] = body
-        entities = [e for e in old.entities if e.name != "scene-0_object"]
+        if self.VARIANT.table and self._table is None:
+            self._set_scene_config()
+            self._table = physics.table_entity("scene-0_table", self.scene.can_render())
+        entities = [e for e in old.entities if e.name not in ("scene-0_object", "scene-0_table")]
         for entity in list(old.entities):
             old.remove_entity(entity)
         self._set_scene_config()
@@ -324,6 +333,9 @@ class TactileSLAMEnv(BaseEnv):
             new.add_entity(entity)
         body.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(pose))
         new.add_entity(body)
+        if self._table is not None:
+            self._table.pose = physics.table_pose(prepared)
+            new.add_entity(self._table)
         robot.set_root_pose(AdroitHand.base_pose())
         robot.set_qpos(qpos)
         robot.set_qvel(np.zeros_like(qpos))
@@ -437,4 +449,27 @@ class TactileSLAMEnv(BaseEnv):
         return self._sensing.touched_step
 
 
-register(ENVIRONMENT_ID, TactileSLAMEnv, max_episode_steps=HORIZON)
+class TactileSLAMTabletopEnv(TactileSLAMEnv):
+    """The same task with the object standing on a table: poses 0..3 only.
+
+    **Description.** As in ``TactileSLAM-v0``, but a table (``TABLE_SIZE``, its top at the object's lowest point) blocks the
+    hand from below. The object stays at the workspace centre and stays fixed. Where the table is, is known, so contact
+    with it is discounted: ``touch`` and the touched voxels are those of the object alone, as its signed distance says.
+    The table's top follows from the object's height, which no observation states; the hand finds it by being stopped.
+
+    **Actions, observations, rewards, starting state, episode end.** As in ``TactileSLAM-v0``.
+
+    Args:
+        pose: 0..3 for every episode; None draws one per episode. All other arguments as in ``TactileSLAM-v0``.
+
+    Raises:
+        InvalidInputError: a pose that is not 0..3, or what ``TactileSLAM-v0`` refuses.
+
+    **Version history.** v0: first version. Not part of the ranking: submissions are for ``TactileSLAM-v0``.
+    """
+
+    VARIANT = TABLETOP
+
+
+register(FREE.id, TactileSLAMEnv, max_episode_steps=HORIZON)
+register(TABLETOP.id, TactileSLAMTabletopEnv, max_episode_steps=HORIZON)

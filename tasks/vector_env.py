@@ -17,7 +17,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
@@ -77,7 +76,7 @@ class TactileVectorEnv(VectorEnv):
         ):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
                 raise InvalidInputError(f"{name} {value!r}: must be a whole number from {low} to {high}")
-        settings.sampler()  # fail here, in one line, rather than in a worker
+        self._variant = settings.sampler().variant  # fail here, in one line, rather than in a worker
         self.num_envs = int(num_envs)
         self.single_observation_space = observation_space()
         self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
@@ -134,7 +133,7 @@ class TactileVectorEnv(VectorEnv):
         names = self._option(options, "object")
         poses = self._option(options, "pose")
         for pose in poses or ():
-            grids.check_pose(pose)
+            self._variant.check_pose(pose)
         for part, (_, pipe) in zip(self._slices, self._workers, strict=True):
             envs = np.flatnonzero(mask[part]).tolist()
             chosen = [part.start + env for env in envs]

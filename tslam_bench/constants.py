@@ -11,6 +11,8 @@ PROTOCOL_VERSION: Final = 1
 
 ENVIRONMENT_ID: Final = "TactileSLAM-v0"
 """Gymnasium id of the default task."""
+TABLETOP_ID: Final = "TactileSLAM-Tabletop-v0"
+"""Gymnasium id of the task whose object stands on a table."""
 
 # --- Section 1: workspace and grid -----------------------------------------------------------------------------
 WORKSPACE_EDGE: Final = 0.25
@@ -30,6 +32,9 @@ NUM_JOINTS: Final = 28
 NUM_POSES: Final = 8
 PROTOCOL_POSES: Final[dict[int, tuple[int, ...]]] = {4: (0, 2, 5, 7), 8: (0, 1, 2, 3, 4, 5, 6, 7)}
 """Pose indices of the 4-pose and the 8-pose protocol."""
+TABLE_SIZE: Final = (0.30, 0.30, 0.05)
+"""Edges (m) of the tabletop variant's table, a box below the object: wider than W, and short enough towards the arm that the
+forearm (50 mm thick) can hang in front of its edge while the fingers reach down to it."""
 
 # --- Section 4: time -------------------------------------------------------------------------------------------
 PHYSICS_FREQUENCY: Final = 133

@@ -20,7 +20,8 @@ _QUARTER_TURNS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # (cos, sin) of yaw 0, 90, 
 
 def check_pose(pose: int) -> int:
     """Returns ``pose`` as an int. Raises InvalidInputError unless it is one of 0..7."""
-    if isinstance(pose, bool) or int(pose) != pose or not 0 <= int(pose) < NUM_POSES:
+    whole = isinstance(pose, (int, np.integer)) or (isinstance(pose, (float, np.floating)) and float(pose).is_integer())
+    if isinstance(pose, bool) or not whole or not 0 <= int(pose) < NUM_POSES:
         raise InvalidInputError(f"pose {pose!r}: unknown; choose an integer from 0 to {NUM_POSES - 1}")
     return int(pose)
 

@@ -10,9 +10,7 @@ import gymnasium.vector
 
 from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import InvalidInputError
-
-ENVIRONMENT_IDS = (ENVIRONMENT_ID,)
-"""Every id that the package registers."""
+from tslam_bench.variants import ENVIRONMENT_IDS, get_variant
 
 
 def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
@@ -50,7 +48,7 @@ def make_vec(
         object: one object for every episode.
         objects: names to draw from, one draw per episode; neither means the whole split.
         split: ``test``, ``train`` or ``val``.
-        pose: 0..7 for every episode; None draws.
+        pose: one of the environment's poses for every episode; None draws.
         reward_mode: see the environment.
         control_mode: see the environment.
         processes: CPU worker processes; None means the cores.
@@ -59,8 +57,7 @@ def make_vec(
         InvalidInputError: unknown id, device, object, pose or mode; CUDA asked for where there is none.
         AssetError: objects or the hand are not prepared.
     """
-    if environment_id not in ENVIRONMENT_IDS:
-        raise InvalidInputError(f"environment {environment_id!r}: unknown; choose one of {', '.join(ENVIRONMENT_IDS)}")
+    get_variant(environment_id)
     if device not in ("auto", "cpu", "cuda"):
         raise InvalidInputError(f"device {device!r}: unknown; choose auto, cpu or cuda")
     if device != "cpu" and _cuda_available():
@@ -82,7 +79,8 @@ def make_vec(
     from tslam_bench.tasks.vector_env import TactileVectorEnv
 
     chosen = None if objects is None else tuple(objects)
-    return TactileVectorEnv(num_envs, BatchSettings(object, chosen, split, pose, reward_mode, control_mode), processes)
+    settings = BatchSettings(object, chosen, split, pose, reward_mode, control_mode, environment_id)
+    return TactileVectorEnv(num_envs, settings, processes)
 
 
 def _cuda_available() -> bool:

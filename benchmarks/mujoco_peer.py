@@ -1,0 +1,210 @@
+"""The benchmark's hand and objects in MuJoCo: a peer to measure the CPU engine against, not part of the product.
+
+:class:`MujocoScene` has the methods of ``tslam_bench.tasks.hand_scene.HandScene``, so the rest of the engine (worker processes,
+shared memory, drive targets, sensing, rewards, episode starts) runs unchanged on top of it: what differs is the physics.
+The hand is the same URDF, its drives are position actuators with the same gains and force limits, the object is a mocap body of
+the same convex hulls. Needs ``mujoco``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tslam_bench.assets.store import PreparedObject
+from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS
+from tslam_bench.hand_constants import (
+    ARMATURE,
+    BASE_POSITION,
+    BASE_QUATERNION,
+    DAMPING,
+    FORCE_LIMIT,
+    JOINT_NAMES,
+    SKIN_LINKS,
+    STIFFNESS,
+)
+from tslam_bench.tasks import batch, physics, vector_env
+from tslam_bench.tasks.starts import Start
+
+_HAND, _OBJECT = 1, 2  # contact bits: the hand collides with the object only
+
+
+@dataclass(frozen=True)
+class MujocoSettings:
+    """What can be tuned of the peer; the defaults are MuJoCo's own but for the time step."""
+
+    substeps: int = SUBSTEPS
+    """Physics steps per control step of 30.1 ms."""
+    integrator: str = "implicitfast"
+    """``euler``, ``implicitfast`` or ``implicit``."""
+    time_constant: float = 0.02
+    """Contact softness ``solref[0]`` (s); MuJoCo raises it to two time steps where it is less."""
+    impedance: tuple[float, float, float] = (0.9, 0.95, 0.001)
+    """Contact softness ``solimp[:3]``: at no penetration, at ``width`` and deeper, width (m)."""
+    margin: float = 0.0
+    """Distance (m) from which a contact pushes."""
+    speculative: bool = False
+    """Whether contacts that would come about within a step act before they do."""
+
+
+STIFF: Final = MujocoSettings(time_constant=1e-3, impedance=(0.999, 0.9999, 1e-4))
+"""The stiffest contacts that MuJoCo integrates safely: it raises the time constant to two time steps."""
+EQUAL_PENETRATION: Final = replace(STIFF, substeps=6)
+"""The coarsest time step at which the peer sinks in no deeper than the engine; found by ``penetration.py``."""
+
+
+@dataclass
+class MujocoPool:
+    """Compiled models of one process, one per object, and the states that its scenes have given back."""
+
+    settings: MujocoSettings
+    urdf: Path
+    _models: dict[str, Any] = field(default_factory=dict)
+    _free: dict[str, list[Any]] = field(default_factory=dict)
+
+    def borrow(self, prepared: PreparedObject) -> tuple[Any, Any]:
+        """The model of an object and a state of it that no scene uses."""
+        model = self._models.get(prepared.name)
+        if model is None:
+            model = self._models[prepared.name] = build_model(self.urdf, self.settings, prepared)
+        waiting = self._free.get(prepared.name)
+        return model, waiting.pop() if waiting else mujoco.MjData(model)
+
+    def give_back(self, name: str, data: Any) -> None:
+        """Takes a state that a scene has done with."""
+        self._free.setdefault(name, []).append(data)
+
+
+class MujocoScene:
+    """A hand that explores one object at a time; see ``HandScene``."""
+
+    def __init__(self, pool: MujocoPool) -> None:
+        self._pool = pool
+        self._name = ""
+        self.model: Any = None
+        self.data: Any = None
+
+    def begin(self, start: Start) -> None:
+        """Starts an episode from a clean state."""
+        if self.data is not None:
+            self._pool.give_back(self._name, self.data)
+        self._name = start.prepared.name
+        self.model, self.data = self._pool.borrow(start.prepared)
+        mujoco.mj_resetData(self.model, self.data)
+        self._joints = np.array([self.model.joint(name).qposadr[0] for name in JOINT_NAMES])
+        self._bodies = np.array([self.model.body(name).id for name in SKIN_LINKS])
+        self.data.mocap_quat[0] = physics.pose_quaternion(start.pose)
+        self.data.qpos[self._joints] = start.qpos
+        self.set_targets(start.qpos)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def set_targets(self, targets: NDArray[np.float32]) -> None:
+        """Sets the (28,) drive targets, in the order of ``JOINT_NAMES``."""
+        self.data.ctrl[:] = targets  # actuators are in that order
+
+    def step(self) -> None:
+        """One control step."""
+        mujoco.mj_step(self.model, self.data, nstep=self._pool.settings.substeps)
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves the body poses of the step before
+
+    def read(self, qpos: NDArray, qvel: NDArray, link_matrices: NDArray) -> None:
+        """Writes (28,) positions, (28,) velocities and (L, 3, 4) poses of the skin links into the given arrays."""
+        data = self.data
+        qpos[:] = data.qpos[self._joints]
+        qvel[:] = data.qvel[self._joints]
+        link_matrices[:, :, :3] = data.xmat[self._bodies].reshape(-1, 3, 3)
+        link_matrices[:, :, 3] = data.xpos[self._bodies]
+
+
+def build_model(urdf: Path, settings: MujocoSettings, prepared: PreparedObject | None) -> Any:
+    """Compiles the hand, and an object in front of it.
+
+    Args:
+        urdf: the converted hand.
+        settings: time step and contact softness.
+        prepared: the object; None leaves the hand alone in space.
+    """
+    text = urdf.read_text(encoding="utf-8")
+    compiler = '<mujoco><compiler discardvisual="true" fusestatic="false"/></mujoco>'
+    spec = mujoco.MjSpec.from_string(text.replace("</robot>", f"{compiler}</robot>"))
+    option = spec.option
+    option.timestep = CONTROL_STEP_SECONDS / settings.substeps
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{settings.integrator.upper()}")
+    option.gravity = np.zeros(3)
+    if settings.speculative:
+        option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
+    base = spec.body("base")
+    base.pos, base.quat = BASE_POSITION, BASE_QUATERNION
+    for index, name in enumerate(JOINT_NAMES):
+        joint = spec.joint(name)
+        joint.armature = ARMATURE[index]
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # the actuator has the same limit
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=STIFFNESS[index], kv=DAMPING[index])
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = (-FORCE_LIMIT[index], FORCE_LIMIT[index])
+    for geom in spec.geoms:
+        _soften(geom, settings)
+        geom.contype, geom.conaffinity = _HAND, _OBJECT
+    if prepared is not None:
+        body = spec.worldbody.add_body(name="object", mocap=True)
+        for index, (vertices, _) in enumerate(prepared.hulls):
+            mesh = spec.add_mesh(name=f"hull{index}")
+            mesh.uservert = np.asarray(vertices, dtype=np.float32).reshape(-1)
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+            _soften(geom, settings)
+            geom.contype, geom.conaffinity = _OBJECT, _HAND
+    return spec.compile()
+
+
+def _soften(geom: Any, settings: MujocoSettings) -> None:
+    geom.friction[0] = physics.DYNAMIC_FRICTION
+    geom.solref[0] = settings.time_constant
+    geom.solimp[:3] = settings.impedance
+    geom.margin = settings.margin / 2  # MuJoCo adds those of the two geoms
+
+
+def _scenes(settings: MujocoSettings) -> Any:
+    """What takes the place of ``HandScene`` in ``tslam_bench.tasks.batch``: makes scenes that share one pool."""
+    pools: dict[Path, MujocoPool] = {}
+
+    def make(urdf: Path, _bodies: Any) -> MujocoScene:
+        return MujocoScene(pools.setdefault(urdf, MujocoPool(settings, urdf)))
+
+    return make
+
+
+@contextmanager
+def mujoco_batches(settings: MujocoSettings) -> Iterator[None]:
+    """Every ``HandBatch`` made inside simulates with MuJoCo."""
+    with mock.patch.object(batch, "HandScene", _scenes(settings)):
+        yield
+
+
+_ENGINE_WORK: Final = vector_env._work
+
+
+def _work(settings: MujocoSettings, *arguments: Any) -> None:
+    with mujoco_batches(settings):
+        _ENGINE_WORK(*arguments)
+
+
+def make_mujoco_vec(
+    num_envs: int,
+    settings: batch.BatchSettings,
+    processes: int | None = None,
+    mujoco_settings: MujocoSettings | None = None,
+) -> vector_env.TactileVectorEnv:
+    """``TactileVectorEnv`` whose workers simulate with MuJoCo; everything else is the engine's own code."""
+    with mock.patch.object(vector_env, "_work", partial(_work, mujoco_settings or MujocoSettings())):
+        return vector_env.TactileVectorEnv(num_envs, settings, processes)

@@ -1,0 +1,56 @@
+"""A ruler for penetration that both engines are measured with: MuJoCo's collision detection between hand and object.
+
+It looks at joint positions only, so it does not matter which engine they come from.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from mujoco_peer import MujocoSettings, build_model
+from numpy.typing import NDArray
+
+from tslam_bench.assets.hand import load_hand
+from tslam_bench.assets.store import load_object
+from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
+from tslam_bench.tasks import physics
+
+REACH = 2e-3
+"""Shapes further apart than this (m) are not measured."""
+
+
+class SeparationRuler:
+    """Distances between the hand's shapes and an object's hulls, negative where they overlap.
+
+    Args:
+        name: object of the test split.
+        pose: 0..7.
+    """
+
+    def __init__(self, name: str, pose: int) -> None:
+        self._model = build_model(load_hand().urdf, MujocoSettings(margin=REACH), load_object(name))
+        self._data = mujoco.MjData(self._model)
+        self._data.mocap_quat[0] = physics.pose_quaternion(pose)
+        self._joints = np.array([self._model.joint(joint).qposadr[0] for joint in JOINT_NAMES])
+        object_body = self._model.body("object").id
+        self._is_object = self._model.geom_bodyid == object_body
+        self._row = np.full(self._model.nbody, -1)
+        for row, link in enumerate(SKIN_LINKS):
+            self._row[self._model.body(link).id] = row
+
+    def links(self, qpos: NDArray) -> NDArray[np.float64]:
+        """(L,) smallest distance (m) of each skin link from the object, infinite beyond ``REACH``, at (28,) joint positions."""
+        distance, geoms = self._contacts(qpos)
+        nearest = np.full(len(SKIN_LINKS) + 1, np.inf)  # the last one takes the forearm
+        hand_geom = np.where(self._is_object[geoms[:, 0]], geoms[:, 1], geoms[:, 0])
+        np.minimum.at(nearest, self._row[self._model.geom_bodyid[hand_geom]], distance)
+        return nearest[:-1]
+
+    def nearest(self, qpos: NDArray) -> float:
+        """Smallest distance (m) of any part of the hand, forearm included; infinite beyond ``REACH``."""
+        return float(self._contacts(qpos)[0].min(initial=np.inf))
+
+    def _contacts(self, qpos: NDArray) -> tuple[NDArray, NDArray]:
+        self._data.qpos[self._joints] = qpos
+        mujoco.mj_fwdPosition(self._model, self._data)
+        return self._data.contact.dist, self._data.contact.geom.reshape(-1, 2)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
     ARMATURE,
     BASE_POSITION,
@@ -178,7 +179,9 @@ def _scenes(settings: MujocoSettings) -> Any:
     """What takes the place of ``HandScene`` in ``tslam_bench.tasks.batch``: makes scenes that share one pool."""
     pools: dict[Path, MujocoPool] = {}
 
-    def make(urdf: Path, _bodies: Any) -> MujocoScene:
+    def make(urdf: Path, _bodies: Any, table: bool = False) -> MujocoScene:
+        if table:
+            raise InvalidInputError("the MuJoCo peer has no table; measure TactileSLAM-v0")
         return MujocoScene(pools.setdefault(urdf, MujocoPool(settings, urdf)))
 
     return make

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 
+import mujoco
 import numpy as np
 import pytest
-
-mujoco = pytest.importorskip("mujoco")
 from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, build_model, make_mujoco_vec, mujoco_batches
 from rollouts import Hands, PressingHands, run_episode
 from separation import REACH, SeparationRuler

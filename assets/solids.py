@@ -38,10 +38,13 @@ def ring(section: ArrayLike, segments: int = SEGMENTS) -> Manifold:
 
 
 def _turn(polygon: NDArray[np.float64], segments: int) -> Manifold:
+    return CrossSection([_counterclockwise(polygon)]).revolve(segments)
+
+
+def _counterclockwise(polygon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The polygon (N, 2) in the order that encloses it from the left: the other one counts as empty."""
     x, y = polygon.T
-    if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0:
-        polygon = polygon[::-1]
-    return CrossSection([polygon]).revolve(segments)
+    return polygon[::-1] if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0 else polygon
 
 
 def vessel(profile: ArrayLike, wall: float, floor: float | None = None, segments: int = SEGMENTS) -> Manifold:
@@ -191,13 +194,11 @@ def cylinder(radius: float, height: float, top_radius: float | None = None, segm
 
 def prism(outline: ArrayLike, height: float, rounding: float = 0.0, holes: Sequence[ArrayLike] = ()) -> Manifold:
     """Extrusion along z, centred in z, of a polygon (N, 2) whose corners may be rounded, minus ``holes``."""
-    section = CrossSection([np.asarray(outline, dtype=float)])
-    if section.area() < 0:
-        section = CrossSection([np.asarray(outline, dtype=float)[::-1]])
+    section = CrossSection([_counterclockwise(np.asarray(outline, dtype=float))])
     if rounding > 0:
         section = section.offset(-rounding, JoinType.Round, 2.0, 24).offset(rounding, JoinType.Round, 2.0, 24)
     for hole in holes:
-        section = section - CrossSection([np.asarray(hole, dtype=float)])
+        section = section - CrossSection([_counterclockwise(np.asarray(hole, dtype=float))])
     return section.extrude(height).translate([0, 0, -height / 2])
 
 

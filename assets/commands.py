@@ -24,7 +24,7 @@ QUICK_GENERATED = {"train": 24, "val": 6}
 """Generated objects of the quick run."""
 FULL_GENERATED = {"train": 600, "val": 60}
 """Objects of a set that is generated only."""
-ADDED_ROUNDS = 6
+ADDED_ROUNDS = {"train": 5, "val": 6}
 """Generated objects per category that the default set has beside the real ones."""
 
 
@@ -201,7 +201,9 @@ def _training_sources(command: Prepare, split: str) -> tuple[list[Any], list[Any
     real: list[Any] = []
     only_generated = command.quick or command.source == "generated"
     if command.source != "furniture":
-        generated = list(generate.candidates(split, rounds=200 if only_generated or command.objects else ADDED_ROUNDS))
+        generated = list(
+            generate.candidates(split, rounds=200 if only_generated or command.objects else ADDED_ROUNDS[split])
+        )
     if not only_generated and not _all_known(command.objects, generated):
         real = list(furniture.furniture(split, cache_directory()))
     return generated, real

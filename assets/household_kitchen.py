@@ -127,12 +127,12 @@ def cake_stand(g: Random) -> tuple[Manifold, int]:
 @category("train", 0.14, 0.24)
 def muffin_tin(g: Random) -> tuple[Manifold, int]:
     """A baking tin with round or square hollows."""
-    rows, columns = int(g.integers(1, 3)), int(g.integers(2, 4))
+    rows, columns = [(1, 2), (1, 3), (1, 4), (2, 2)][int(g.integers(4))]
     height, radius, floor = g.uniform(0.35, 0.6), g.uniform(0.33, 0.4), 0.13
     border = g.uniform(0.1, 0.25)
     body = box(columns + border, rows + border, height, 0.05).translate([0, 0, height / 2])
     square = g.random() < 0.35
-    outline = superellipse(radius, radius, 5) if square else circle(radius, 24)
+    outline = superellipse(radius, radius, 5) if square else circle(radius, 20)
     hollow = prism(outline, height).translate([0, 0, height / 2 + floor])
     hollows = [
         hollow.translate([i - (columns - 1) / 2, j - (rows - 1) / 2, 0]) for i in range(columns) for j in range(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,16 +218,17 @@ def _all_known(names: tuple[str, ...], sources: list[Any]) -> bool:
 def _show_progress(
     title: str, items: Sequence[Any], count: int | None, workers: int, time_limit: float
 ) -> tuple[dict[str, int], list[Any]]:
-    """Prepares with a progress bar and a line per object; returns how many of each status, and all outcomes."""
-    from tslam_bench.assets.prepare import prepare
+    """Prepares with a progress bar and a line per object; returns how many of each status, and an outcome per object."""
+    from tslam_bench.assets.prepare import prepare_distinct
 
-    tally: dict[str, int] = {}
-    outcomes = []
+    outcomes: dict[str, Any] = {}
     with tqdm(total=count or len(items), unit="object", desc=title, dynamic_ncols=True) as bar:
-        for outcome in prepare(items, count=count, workers=workers, time_limit=time_limit):
-            outcomes.append(outcome)
-            tally[outcome.status] = tally.get(outcome.status, 0) + 1
-            if count is None or outcome.record is not None:
+        for outcome in prepare_distinct(items, count=count, workers=workers, time_limit=time_limit):
+            dropped = outcome.name in outcomes
+            outcomes[outcome.name] = outcome
+            if dropped:
+                bar.update(-1 if count is not None else 0)
+            elif count is None or outcome.record is not None:
                 bar.update()
             if outcome.record is None:
                 bar.write(f"{outcome.name}: {outcome.status}: {outcome.message}")
@@ -234,7 +236,7 @@ def _show_progress(
                 why = f" (rebuilt: {outcome.message})" if outcome.message else ""
                 iou = outcome.record["gates"]["hull_iou"]
                 bar.write(f"{outcome.name}: {outcome.record['hull_count']} hulls, hull IoU {iou:.3f}{why}")
-    return tally, outcomes
+    return dict(Counter(outcome.status for outcome in outcomes.values())), list(outcomes.values())
 
 
 def _prepare_hand(again: bool) -> None:
@@ -266,12 +268,21 @@ def _prepare(command: Prepare) -> None:
         _prepare_hand(again=False)
     else:
         write_attributions(store.list_objects(split), cache_directory() / f"attributions-{split}.json")
+        _renew_val_manifest(split)
     path = write_manifest(split)
     if command.write_manifest is not None:
         write_manifest(split, command.write_manifest)
     summary = ", ".join(f"{number} {status}" for status, number in tally.items())
     print(f"{summary}; {time.monotonic() - started:.0f} s; manifest: {path}")
     _complain(split, outcomes, count, strict=split == "test" or command.manifest is not None or bool(command.objects))
+
+
+def _renew_val_manifest(split: str) -> None:
+    """Preparing train can drop objects of val that repeat one of train: the manifest of val follows."""
+    from tslam_bench.assets.prepare import write_manifest
+
+    if split == "train" and (cache_directory() / "manifest-val.json").exists():
+        write_manifest("val")
 
 
 def _complain(split: str, outcomes: list[Any], count: int | None, strict: bool) -> None:
@@ -296,6 +307,7 @@ def _import(command: Import) -> None:
     write_json(path, summary)
     if any(outcome.record is not None for outcome in outcomes):
         write_manifest(command.split)
+        _renew_val_manifest(command.split)
     print(f"{', '.join(f'{number} {status}' for status, number in summary['counts'].items())}; report: {path}")
     if all(outcome.record is None for outcome in outcomes):
         raise AssetError(f"{command.folder}: no mesh could be imported; the reasons are in {path}")

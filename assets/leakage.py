@@ -111,8 +111,11 @@ def descriptor_distance(first: Shape, second: Shape) -> float:
     return float(np.abs(first.descriptor - second.descriptor).sum())
 
 
-def overlap(first: Shape, second: Shape) -> float:
-    """IoU of two normalised solids, aligned by the rotation or reflection found to be best."""
+def overlap(first: Shape, second: Shape, guesses: NDArray[np.float64] | None = None) -> float:
+    """IoU of two normalised solids, aligned by the rotation or reflection found to be best.
+
+    ``guesses`` (G, 3, 3) are rotations and reflections from first to second that are tried besides random ones.
+    """
     low, high = second.mesh.bounds
     spacing = float((high - low).max()) / (_GRID - 3)
     size = np.ceil((high - low) / spacing).astype(int) + 3
@@ -134,6 +137,8 @@ def overlap(first: Shape, second: Shape) -> float:
     generator = np.random.default_rng(_SEED)
     rotations = Rotation.random(_ROTATIONS, rng=generator).as_matrix()
     candidates = np.concatenate([rotations, rotations @ np.diag([1.0, 1.0, -1.0])])
+    if guesses is not None:
+        candidates = np.concatenate([candidates, guesses])
     coarse = score(candidates, first.points[:_COARSE_POINTS], soft)
     best = candidates[np.argsort(coarse)[-_REFINED:]]
     for angle in (0.15, 0.08, 0.04, 0.02, 0.01, 0.005, 0.003):

@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from tslam_bench.assets.fetch import fetch
 from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import PROTOCOL_VERSION
 from tslam_bench.errors import BenchmarkError
-from tslam_bench.files import cache_directory, ensure_writable_directory, write_json
+from tslam_bench.files import cache_directory, ensure_writable_directory, remove_directory, write_json
 
 MANIFEST_VERSION = 1
 """Version of the manifest's layout."""
@@ -167,6 +167,74 @@ def prepare(
         pool.close()
 
 
+def prepare_distinct(
+    items: Iterable[Any],
+    count: int | None = None,
+    cache: Path | None = None,
+    workers: int = 2,
+    time_limit: float = TIME_LIMIT,
+) -> Iterator[Outcome]:
+    """:func:`prepare`, and then drops what is a copy of another object of train or val.
+
+    Of two copies the one that comes first in ``items`` stays; objects of the split that are not in ``items`` stay; train
+    goes before val. A dropped object gets a second outcome, ``rejected``, and with ``count`` the next source takes its place.
+    What remains does not depend on the number or the speed of the workers.
+
+    Raises:
+        AssetError: as :func:`prepare`.
+    """
+    items = list(items)
+    kept: set[str] = set()
+    position = 0
+    while True:
+        wanted = None if count is None else count - len(kept)
+        for outcome in prepare(items[position:], wanted, cache, workers, time_limit):
+            position += 1
+            if outcome.record is not None:
+                kept.add(outcome.name)
+            yield outcome
+        dropped = drop_copies(items, cache)
+        kept -= {outcome.name for outcome in dropped}
+        yield from dropped
+        if count is None or len(kept) >= count or position >= len(items):
+            return
+
+
+def drop_copies(items: Sequence[Any], cache: Path | None = None) -> list[Outcome]:
+    """Removes prepared objects that are copies of others (:mod:`tslam_bench.assets.duplicates`) and remembers that.
+
+    Args:
+        items: the sources that were prepared, most wanted first, all of one split.
+        cache: cache directory (default: the user's).
+
+    Returns:
+        a ``rejected`` outcome for every object of ``items`` that was removed. Objects of val that repeat one of train are
+        removed whenever either split is prepared, but only those in ``items`` are returned.
+    """
+    from tslam_bench.assets import duplicates
+    from tslam_bench.assets.pipeline import LEAKAGE_SPLITS
+
+    cache = cache or cache_directory()
+    split = items[0].split if items else ""
+    if split not in LEAKAGE_SPLITS:
+        return []
+    prepared = {each: store.prepared_names(each, cache) for each in LEAKAGE_SPLITS}
+    names = list(dict.fromkeys(item.name for item in items))
+    examined = [(split, name) for name in names if name in set(prepared[split])]
+    others = [(split, name) for name in prepared[split] if name not in set(names)]
+    train = [("train", name) for name in prepared["train"]]
+    copies = duplicates.find(examined, others if split == "train" else [*train, *others], cache)
+    if split == "train":
+        gone = {copy.copy for copy in copies}
+        remaining = [key for key in train if key not in gone]
+        copies += duplicates.find([("val", name) for name in prepared["val"]], remaining, cache, only_fixed=True)
+    rejections = _Rejections(cache)
+    for copy in copies:
+        rejections.add_record(store.read_record(copy.copy[1], copy.copy[0], cache), copy.reason)
+        remove_directory(store.object_directory(copy.copy[1], copy.copy[0], cache))
+    return [Outcome(copy.copy[1], "rejected", copy.reason, None) for copy in copies if copy.copy[0] == split]
+
+
 def _prepare_shared(item: Any, cache: Path) -> None:
     """Fetches what several workers need, once, before they start."""
     from tslam_bench.assets.pipeline import LEAKAGE_SPLITS
@@ -213,9 +281,16 @@ class _Rejections:
         """Remembers a rejection."""
         from tslam_bench.assets.pipeline import parameters_sha256
 
-        entries = self._read(source.split)
-        entries[source.name] = {"parameters_sha256": parameters_sha256(source), "reason": reason}
-        write_json(self._path(source.split), entries)
+        self._write(source.split, source.name, parameters_sha256(source), reason)
+
+    def add_record(self, record: dict[str, Any], reason: str) -> None:
+        """Remembers the rejection of an object that was prepared."""
+        self._write(record["split"], record["name"], record["parameters_sha256"], reason)
+
+    def _write(self, split: str, name: str, parameters: str, reason: str) -> None:
+        entries = self._read(split)
+        entries[name] = {"parameters_sha256": parameters, "reason": reason}
+        write_json(self._path(split), entries)
 
 
 def write_manifest(split: str, path: Path | None = None, cache: Path | None = None) -> Path:

@@ -75,7 +75,10 @@ def repair(mesh: TriangleMesh) -> Repaired:
     if not is_valid(solid) or solid.volume() <= 0:
         raise AssetError(f"no solid can be made of the mesh (repair by {method}: {solid.status().name})")
     solid, kept_share = largest_part(solid)
-    return Repaired(_without_crumbs(simplify(solid, MAX_TRIANGLES)), method, kept_share)
+    simplified = _without_crumbs(simplify(solid, MAX_TRIANGLES))
+    if simplified.is_empty():
+        raise AssetError("flat: nothing is left of the mesh when it is simplified")
+    return Repaired(simplified, method, kept_share)
 
 
 def _without_crumbs(solid: manifold3d.Manifold) -> manifold3d.Manifold:

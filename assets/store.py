@@ -257,6 +257,16 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
         ) from error
 
 
+def load_surface(name: str, split: str, cache: Path | None = None) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Ground-truth mesh alone of one prepared object: vertices (V, 3) in metres and faces (F, 3).
+
+    Raises:
+        AssetError: it is not prepared, or a product is missing or corrupt.
+    """
+    directory, record = object_directory(name, split, cache), read_record(name, split, cache)
+    return _read_array(directory, "vertices", record), _read_array(directory, "faces", record).astype(np.int64)
+
+
 def _face_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)

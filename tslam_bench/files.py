@@ -93,6 +93,13 @@ def atomic_directory(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def remove_directory(path: Path) -> None:
+    """Removes a directory as a whole: it is moved out of sight first, so that nobody sees half of it."""
+    hidden = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-old-"))
+    path.replace(hidden / path.name)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
 def write_json(path: Path, value: Any) -> None:
     """Writes ``value`` as sorted, indented JSON, atomically."""
     with atomic_file(path) as temporary:

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import Delaunay, QhullError
+from scipy.spatial.distance import cdist
 
 ALPHA_RADIUS: Final = 0.03
 """Tetrahedra with a circumradius above this (m) are left out of the shape."""
@@ -52,11 +53,8 @@ def alpha_shape_triangles(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points[unique[count == 1]]
 
 
-def alpha_shape_samples(points: NDArray) -> NDArray[np.float64] | None:
-    """(SAMPLES, 3) low-discrepancy samples on the alpha shape; the points themselves while it is empty, None without points."""
-    if len(points) == 0:
-        return None
-    points = thin_out(points)
+def alpha_shape_samples(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(SAMPLES, 3) low-discrepancy samples on the alpha shape of (m, 3) thinned points; the points while it is empty."""
     triangles = alpha_shape_triangles(points)
     area = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     if area.sum() <= 0:
@@ -69,6 +67,6 @@ def alpha_shape_samples(points: NDArray) -> NDArray[np.float64] | None:
 
 
 def chamfer_l2(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """``0.5 * (mean_a d^2 + mean_b d^2)`` between two point sets, in the square of their unit."""
-    to_b, to_a = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-    return float(0.5 * (np.mean(to_b**2) + np.mean(to_a**2)))
+    """``0.5 * (mean_a d^2 + mean_b d^2)`` between two small point sets, in the square of their unit."""
+    squared = cdist(a, b, "sqeuclidean")
+    return float(0.5 * (np.mean(squared.min(axis=1)) + np.mean(squared.min(axis=0))))

@@ -14,10 +14,11 @@ from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES, SKIN_LINKS
 from tslam_bench.tasks.arrays import NumpyBackend
+from tslam_bench.tasks.compiled_sensing import CompiledSensing
 from tslam_bench.tasks.control import DriveTargets
 from tslam_bench.tasks.hand_scene import BodyPool, HandScene
+from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
 from tslam_bench.tasks.rewards import Rewards
-from tslam_bench.tasks.sensing import TactileSensing
 from tslam_bench.tasks.skin import build_skin
 from tslam_bench.tasks.starts import StartSampler
 from tslam_bench.variants import get_variant
@@ -91,10 +92,14 @@ class HandBatch:
         self._starts = settings.sampler()
         table = self._starts.variant.table
         self._scenes = [HandScene(hand.urdf, bodies, table) for _ in range(num_envs)]
-        self._sensing = TactileSensing(num_envs, build_skin(hand.shapes), backend)
+        self._sensing = CompiledSensing(num_envs, build_skin(hand.shapes), arrays["occupancy"])
         self._targets = DriveTargets(settings.control_mode, backend)
         self._rewards = Rewards(settings.reward_mode, num_envs, backend) if settings.reward_mode != "none" else None
         self._rngs: list[np.random.RandomState | None] = [None] * num_envs
+        self._qpos = np.zeros((num_envs, NUM_JOINTS), dtype=np.float32)
+        self._qvel = np.zeros((num_envs, NUM_JOINTS), dtype=np.float32)
+        self._poses = np.zeros((num_envs, self._scenes[0].num_bodies, POSE_SIZE), dtype=np.float32)
+        self._skin_rows = self._scenes[0].skin_rows()
         self._links = np.zeros((num_envs, len(SKIN_LINKS), 3, 4), dtype=np.float32)
         self.object_name = [""] * num_envs
         self.pose = [0] * num_envs
@@ -126,7 +131,7 @@ class HandBatch:
             self._sensing.set_object(env, start.prepared.name, start.prepared.field, start.pose)
             if self._rewards is not None:
                 self._rewards.set_object(env, start.prepared, start.pose)
-            self._read(env)
+        self._read(envs)
         self._sensing.begin(envs)
         if self._rewards is not None:
             self._rewards.begin(envs)
@@ -141,7 +146,6 @@ class HandBatch:
             "new_visited",
             "elapsed_steps",
             "touch",
-            "occupancy",
             "time",
         ):
             self._arrays[name][list(envs)] = 0
@@ -150,18 +154,17 @@ class HandBatch:
         """One control step of all environments with the actions in the arrays; ended episodes start anew at once."""
         arrays = self._arrays
         targets = self._targets(arrays["action"], arrays["qpos"])
-        for env, scene in enumerate(self._scenes):
-            scene.set_targets(targets[env])
+        for scene, target in zip(self._scenes, targets.tolist(), strict=True):
+            scene.set_targets(target)
+        for scene in self._scenes:
             scene.step()
-            self._read(env)
+        self._read(range(self.num_envs))
         contacts = self._sensing.step(self._links, arrays["elapsed_steps"])
         arrays["elapsed_steps"][:] += 1
         arrays["reward"][:] = 0.0 if self._rewards is None else self._rewards.step(contacts)
         arrays["new_touched"][:] = contacts.new_touched
         arrays["new_visited"][:] = contacts.new_visited
         arrays["touch"][:] = self._sensing.link_touch()
-        arrays["occupancy"][:, 0] = self._sensing.touched
-        arrays["occupancy"][:, 1] = self._sensing.visited
         arrays["time"][:, 0] = arrays["elapsed_steps"] / np.float32(HORIZON)
         ended = np.flatnonzero(arrays["elapsed_steps"] >= HORIZON)
         if len(ended):
@@ -181,8 +184,14 @@ class HandBatch:
         arrays["truncated"][:] = False
         arrays["truncated"][ended] = True
 
-    def _read(self, env: int) -> None:
-        self._scenes[env].read(self._arrays["qpos"][env], self._arrays["qvel"][env], self._links[env])
+    def _read(self, envs: Sequence[int]) -> None:
+        """Reads joints and links of ``envs`` from their scenes."""
+        for env in envs:
+            self._scenes[env].read(self._qpos[env], self._qvel[env], self._poses[env])
+        order = self._scenes[0].joint_order
+        self._arrays["qpos"][:] = self._qpos[:, order]
+        self._arrays["qvel"][:] = self._qvel[:, order]
+        link_matrices(self._poses, self._skin_rows, self._links)
 
     def state(self) -> dict[str, Any]:
         """Objects and poses of the running episodes, touched steps (K, 32, 32, 32): for evaluation, not for learning."""

@@ -26,6 +26,7 @@ from tslam_bench.hand_constants import (
     SKIN_LINKS,
     STIFFNESS,
 )
+from tslam_bench.tasks import link_poses
 from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
 from tslam_bench.tasks.control import DriveTargets
 
@@ -121,12 +122,16 @@ class AdroitHand(BaseAgent):
         """Position of each joint of ``JOINT_NAMES`` in the simulator's own order."""
         self.skin_links = [self.robot.links_map[name] for name in SKIN_LINKS]
         self._raw_skin_links = [link._objs[0] for link in self.skin_links]
+        self._scene_of_rows: Any = None
+        self._skin_rows = np.zeros(len(SKIN_LINKS), dtype=np.int64)
         self._skin_matrices = np.zeros((1, len(SKIN_LINKS), 3, 4), dtype=np.float32)
 
     def host_skin_matrices(self) -> np.ndarray:
         """(1, L, 3, 4) float32 poses of the skin links in the world, CPU simulation; the array is reused."""
-        for row, link in enumerate(self._raw_skin_links):
-            self._skin_matrices[0, row] = link.entity_pose.to_transformation_matrix()[:3]
+        scene = self.scene.sub_scenes[0]
+        if scene is not self._scene_of_rows:  # an episode has a scene of its own
+            self._scene_of_rows, self._skin_rows = scene, link_poses.rows_of(list(scene.entities), self._raw_skin_links)
+        link_poses.link_matrices(link_poses.packed_poses(scene)[None], self._skin_rows, self._skin_matrices)
         return self._skin_matrices
 
     def device_skin_matrices(self) -> torch.Tensor:

@@ -5,6 +5,7 @@ No torch, no ManiSkill: worker processes import this and stay small.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,7 @@ from tslam_bench.hand_constants import (
     SKIN_LINKS,
     STIFFNESS,
 )
-from tslam_bench.tasks import physics
+from tslam_bench.tasks import link_poses, physics
 from tslam_bench.tasks.starts import Start
 
 _NO_SELF_COLLISION: Final = 1 << 29  # shapes that share an ignore bit do not collide
@@ -76,9 +77,9 @@ class HandScene:
         self._robot = _build_hand(self._scene, urdf)
         self._entities = [link.entity for link in self._robot.links]
         joints = {joint.name: index for index, joint in enumerate(self._robot.active_joints)}
-        self._order = np.array([joints[name] for name in JOINT_NAMES])
-        self._from_order = np.argsort(self._order)
-        ordered = [self._robot.active_joints[index] for index in self._order]
+        self.joint_order = np.array([joints[name] for name in JOINT_NAMES])
+        self._from_order = np.argsort(self.joint_order)
+        ordered = [self._robot.active_joints[index] for index in self.joint_order]
         for index, joint in enumerate(ordered):
             joint.set_drive_properties(
                 float(STIFFNESS[index]), float(DAMPING[index]), float(FORCE_LIMIT[index]), "force"
@@ -113,11 +114,11 @@ class HandScene:
         self._robot.set_qpos(qpos)
         self._robot.set_qvel(np.zeros_like(qpos))
         self._robot.set_qf(np.zeros_like(qpos))
-        self.set_targets(start.qpos)
+        self.set_targets(start.qpos.tolist())
 
-    def set_targets(self, targets: NDArray[np.float32]) -> None:
-        """Sets the (28,) drive targets, in the order of ``JOINT_NAMES``."""
-        for setter, target in zip(self._setters, targets.tolist(), strict=True):
+    def set_targets(self, targets: Sequence[float]) -> None:
+        """Sets the 28 drive targets (m, rad), plain numbers in the order of ``JOINT_NAMES``."""
+        for setter, target in zip(self._setters, targets, strict=True):
             setter(target)
 
     def step(self) -> None:
@@ -125,12 +126,20 @@ class HandScene:
         for _ in range(SUBSTEPS):
             self._system.step()
 
-    def read(self, qpos: NDArray, qvel: NDArray, link_matrices: NDArray) -> None:
-        """Writes (28,) positions, (28,) velocities and (L, 3, 4) poses of the skin links into the given arrays."""
-        qpos[:] = self._robot.qpos[self._order]
-        qvel[:] = self._robot.qvel[self._order]
-        for row, link in enumerate(self._skin_links):
-            link_matrices[row] = link.entity_pose.to_transformation_matrix()[:3]
+    def read(self, qpos: NDArray, qvel: NDArray, poses: NDArray) -> None:
+        """Writes (28,) positions and velocities in the simulator's order (``joint_order``), and (M, 7) packed poses."""
+        qpos[:] = self._robot.qpos
+        qvel[:] = self._robot.qvel
+        poses[:] = link_poses.packed_poses(self._scene)
+
+    @property
+    def num_bodies(self) -> int:
+        """M, bodies of an episode."""
+        return len(self._entities) + (2 if self._table is not None else 1)
+
+    def skin_rows(self) -> NDArray[np.int64]:
+        """(L,) rows of the skin links in the packed poses; the same in every scene."""
+        return link_poses.rows_of(self._entities, self._skin_links)
 
 
 def _build_hand(scene: sapien.Scene, urdf: Path) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from tslam_bench import grids
 from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE
-from tslam_bench.tasks.alpha_shape import alpha_shape_samples, chamfer_l2
+from tslam_bench.tasks.alpha_shape import alpha_shape_samples, chamfer_l2, thin_out
 from tslam_bench.tasks.arrays import Backend
 from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, Contacts
 
@@ -232,26 +232,28 @@ class SurfaceDistance:
 class AlphaShapes:
     """Chamfer-L2 between the alpha shapes of the known contact points before and after a step.
 
-    The triangulation is qhull's, on the host and one environment at a time; only environments that found new points pay.
+    The triangulation is qhull's, on the host and one environment at a time. What bounds its work: the points are thinned out
+    to ``alpha_shape.MAX_POINTS``, and only an environment whose thinned points change pays; for all others it is zero.
     """
 
     def __init__(self, num_envs: int) -> None:
-        self._samples: list[np.ndarray | None] = [None] * num_envs
+        self._shapes: list[tuple[np.ndarray, np.ndarray] | None] = [None] * num_envs  # thinned points, samples
 
     def begin(self, envs: Sequence[int]) -> None:
         """Forgets the shapes of ``envs``."""
         for env in envs:
-            self._samples[env] = None
+            self._shapes[env] = None
 
     def step(self, memory: ContactMemory, mask: Array, backend: Backend) -> Array:
         """(E,) float32 disagreement in metric units."""
-        reward = np.zeros(len(self._samples), dtype=np.float32)
+        reward = np.zeros(len(self._shapes), dtype=np.float32)
         fresh = mask.any(1)
         for env in np.flatnonzero(fresh if backend.is_numpy else fresh.cpu().numpy()):
-            after = alpha_shape_samples(memory.known(int(env)))
-            before = self._samples[env]
-            if before is not None and after is not None:
-                reward[env] = chamfer_l2(before, after) / WORKSPACE_EDGE**2
-            if after is not None:
-                self._samples[env] = after
+            points, before = thin_out(memory.known(int(env))), self._shapes[env]
+            if before is not None and np.array_equal(points, before[0]):
+                continue
+            samples = alpha_shape_samples(points)
+            if before is not None:
+                reward[env] = chamfer_l2(before[1], samples) / WORKSPACE_EDGE**2
+            self._shapes[env] = points, samples
         return backend.array(reward)

@@ -145,14 +145,8 @@ class TactileSensing:
         self._link_of_probe = backend.array(link_of_probe.astype(np.float32))
         self.atlas = FieldAtlas(num_envs, backend)
 
-        zeros, flat = backend.zeros, num_envs * VOXELS + 1  # the last element takes what lies outside W
-        self._touched = zeros(flat, bool)
-        self._visited = zeros(flat, bool)
-        self._touched_step = backend.full(flat, -1, np.int16)
-        self._touched_count = zeros(num_envs, np.int64)
-        self._visited_count = zeros(num_envs, np.int64)
-        self._on = zeros((num_envs, len(skin.probes)), bool)
-        self._env_base = backend.array(np.arange(num_envs, dtype=np.int64)[:, None] * VOXELS)
+        self._on = backend.zeros((num_envs, len(skin.probes)), bool)
+        self._make_grids()
 
         # Per environment, of its object and pose; host copies, pushed to the device after a reset.
         self._objects: list[tuple[str, SignedDistanceField] | None] = [None] * num_envs
@@ -160,6 +154,22 @@ class TactileSensing:
         self._bound = False
 
     # -- grids ------------------------------------------------------------------------------------------------
+    def _make_grids(self) -> None:
+        zeros, flat = self.backend.zeros, self.num_envs * VOXELS + 1  # the last element takes what lies outside W
+        self._touched = zeros(flat, bool)
+        self._visited = zeros(flat, bool)
+        self._touched_step = self.backend.full(flat, -1, np.int16)
+        self._touched_count = zeros(self.num_envs, np.int64)
+        self._visited_count = zeros(self.num_envs, np.int64)
+        self._env_base = self.backend.array(np.arange(self.num_envs, dtype=np.int64)[:, None] * VOXELS)
+
+    def _clear_grids(self, envs: Sequence[int]) -> None:
+        for grid, value in ((self._touched, False), (self._visited, False), (self._touched_step, -1)):
+            rows = grid[:-1].reshape(self.num_envs, VOXELS)
+            rows[list(envs)] = value
+        for count in (self._touched_count, self._visited_count):
+            count[list(envs)] = 0
+
     @property
     def touched(self) -> Array:
         """(E, 32, 32, 32) bool, touched since the episode began; a view."""
@@ -191,11 +201,8 @@ class TactileSensing:
         """Clears the grids and probe memory of ``envs`` for a new episode."""
         if not self._bound:
             self._bind()
-        for grid, value in ((self._touched, False), (self._visited, False), (self._touched_step, -1)):
-            rows = grid[:-1].reshape(self.num_envs, VOXELS)
-            rows[list(envs)] = value
-        for cleared in (self._on, self._touched_count, self._visited_count):
-            cleared[list(envs)] = 0
+        self._clear_grids(envs)
+        self._on[list(envs)] = False
 
     def _bind(self) -> None:
         objects = [entry for entry in self._objects if entry is not None]
@@ -351,21 +358,21 @@ class _BoundPoints:
 
     def __init__(self, points: PointSet, backend: Backend) -> None:
         self._backend = backend
-        self._link = backend.array(points.link)
+        self.link = backend.array(points.link)
         self._num_points = len(points)
-        self._local = backend.array(np.ascontiguousarray(points.position.T))
+        self.local = backend.array(np.ascontiguousarray(points.position.T))
         self.radius = backend.array(points.radius)
 
     def place(self, components: Array) -> Array:
         """(3, E, P) coordinates of all points for link poses (12, E, L)."""
-        taken = self._backend.take_last(components, self._link).reshape(3, 4, -1, self._num_points)
-        return _apply(taken, self._local)
+        taken = self._backend.take_last(components, self.link).reshape(3, 4, -1, self._num_points)
+        return _apply(taken, self.local)
 
     def place_some(self, components: Array, rows: Array, columns: Array) -> Array:
         """(3, n) coordinates of the listed points for link poses (12, E, L)."""
         flat = components.reshape(12, -1)
-        index = rows * components.shape[2] + self._link[columns]
-        return _apply(self._backend.take_last(flat, index).reshape(3, 4, -1), self._local[:, columns])
+        index = rows * components.shape[2] + self.link[columns]
+        return _apply(self._backend.take_last(flat, index).reshape(3, 4, -1), self.local[:, columns])
 
 
 def _apply(poses: Array, local: Array) -> Array:

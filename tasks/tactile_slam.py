@@ -38,6 +38,7 @@ from tslam_bench.hand_constants import (
 )
 from tslam_bench.tasks import physics
 from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
+from tslam_bench.tasks.compiled_sensing import CompiledSensing
 from tslam_bench.tasks.hand_agent import AdroitHand
 from tslam_bench.tasks.rendering import vulkan_device_available
 from tslam_bench.tasks.rewards import Rewards
@@ -212,7 +213,12 @@ class TactileSLAMEnv(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         self._arrays: Backend = TorchBackend(self.device) if self.gpu_sim_enabled else NumpyBackend()
-        self._sensing = TactileSensing(self.num_envs, build_skin(load_hand().shapes), self._arrays)
+        skin = build_skin(load_hand().shapes)
+        self._sensing = (
+            TactileSensing(self.num_envs, skin, self._arrays)
+            if self.gpu_sim_enabled
+            else CompiledSensing(self.num_envs, skin)
+        )
         self._rewards = None
         if self._reward_mode != "none":
             self._rewards = Rewards(self._reward_mode, self.num_envs, self._arrays)
@@ -415,12 +421,12 @@ class TactileSLAMEnv(BaseEnv):
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         touch, touched, visited = self._sensing.link_touch(), self._sensing.touched, self._sensing.visited
-        if self.gpu_sim_enabled:
+        if isinstance(self._sensing, CompiledSensing):
+            occupancy = torch.from_numpy(self._sensing.occupancy.copy())
+            touch = torch.from_numpy(touch.view(np.uint8))
+        else:
             occupancy = torch.stack([touched, visited], dim=1).to(torch.uint8)
             touch = touch.to(torch.uint8)
-        else:
-            occupancy = torch.from_numpy(np.stack([touched, visited], axis=1).view(np.uint8))
-            touch = torch.from_numpy(touch.view(np.uint8))
         time = (self._elapsed_steps.to(torch.float32) / HORIZON).clamp(max=1.0)[:, None]
         return {"touch": touch, "occupancy": occupancy, "time": time}
 

@@ -6,9 +6,10 @@ import contextlib
 import itertools
 import multiprocessing
 import os
+import selectors
+import time
 import traceback
 from collections.abc import Mapping, Sequence
-from multiprocessing import connection
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
 from tslam_bench.tasks.batch import FINAL, OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
 
+_STEP: Final = ("step", None)
 MAX_ENVIRONMENTS: Final = 4096
 """More environments than this in one machine's memory are a slip of the pen."""
 STEP_TIMEOUT: Final = 60.0
@@ -83,7 +85,7 @@ class TactileVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.closed = False
-        count = min(int(processes or len(os.sched_getaffinity(0))), self.num_envs)
+        count = min(int(processes or len(_available_cores())), self.num_envs)
         context = multiprocessing.get_context("spawn")
         # RawArrays are anonymous: nothing is left in the file system, even if the process is killed.
         self._raw = {
@@ -94,14 +96,16 @@ class TactileVectorEnv(VectorEnv):
         bounds = np.linspace(0, self.num_envs, count + 1).astype(int)
         self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
         self._workers: list[tuple[Any, Any]] = []
+        self._selector = selectors.DefaultSelector()
         try:
-            for part in self._slices:
+            for part, core in zip(self._slices, _cores(count), strict=True):
                 ours, theirs = context.Pipe()
                 process = context.Process(
-                    target=_work, args=(theirs, ours, self._raw, self.num_envs, part, settings), daemon=True
+                    target=_work, args=(theirs, ours, self._raw, self.num_envs, part, settings, core), daemon=True
                 )
                 process.start()
                 theirs.close()
+                self._selector.register(ours, selectors.EVENT_READ, len(self._workers))
                 self._workers.append((process, ours))
             self._collect(START_TIMEOUT)
         except BaseException:
@@ -157,7 +161,7 @@ class TactileVectorEnv(VectorEnv):
         self._check_open()
         self._arrays["action"][:] = self._checked(actions)
         for _, pipe in self._workers:
-            self._send(pipe, ("step", None))
+            self._send(pipe, _STEP)
         self._collect(STEP_TIMEOUT)
         truncated = self._arrays["truncated"].copy()
         info = self._info()
@@ -225,29 +229,30 @@ class TactileVectorEnv(VectorEnv):
 
     def _collect(self, timeout: float) -> list[Any]:
         """One answer from every worker, in order; stops all of them and raises if any fails."""
-        answers = []
-        for index, (process, pipe) in enumerate(self._workers):
-            ready = connection.wait([pipe, process.sentinel], timeout)
-            try:
-                if not ready:
-                    raise WorkerError(f"worker {index}: no answer for {timeout:.0f} s; all workers were stopped")
-                if pipe not in ready:
-                    raise EOFError
-                kind, answer = pipe.recv()
-            except (EOFError, ConnectionResetError):
-                process.join(5)
+        answers: dict[int, Any] = {}
+        deadline = time.monotonic() + timeout
+        while len(answers) < len(self._workers):
+            ready = self._selector.select(max(0.0, deadline - time.monotonic()))
+            if not ready:
+                silent = next(index for index in range(len(self._workers)) if index not in answers)
                 self._stop()
-                raise WorkerError(
-                    f"worker {index}: died (exit code {process.exitcode}); all workers were stopped, make a new environment"
-                ) from None
-            except WorkerError:
-                self._stop()
-                raise
-            if kind == "error":
-                self._stop()
-                raise answer
-            answers.append(answer)
-        return answers
+                raise WorkerError(f"worker {silent}: no answer for {timeout:.0f} s; all workers were stopped")
+            for key, _ in ready:
+                process, pipe = self._workers[key.data]
+                try:
+                    kind, answer = pipe.recv()
+                except (EOFError, ConnectionResetError):  # a worker that dies closes its end of the pipe
+                    process.join(5)
+                    self._stop()
+                    raise WorkerError(
+                        f"worker {key.data}: died (exit code {process.exitcode}); all workers were stopped, "
+                        "make a new environment"
+                    ) from None
+                if kind == "error":
+                    self._stop()
+                    raise answer
+                answers[key.data] = answer
+        return [answers[index] for index in range(len(self._workers))]
 
     def _stop(self) -> None:
         for _, pipe in self._workers:
@@ -260,12 +265,36 @@ class TactileVectorEnv(VectorEnv):
                 process.kill()
                 process.join()
         self._workers = []
+        self._selector.close()
 
     def _observation(self) -> dict[str, NDArray]:
         return {name: self._arrays[name].copy() for name in OBSERVATION_ARRAYS}
 
     def _info(self) -> dict[str, Any]:
         return {name: self._arrays[name].copy() for name in ("elapsed_steps", "new_touched", "new_visited")}
+
+
+def _available_cores() -> list[int]:
+    """The cores that this process may use."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
+
+
+def _cores(count: int) -> list[int | None]:
+    """The core that each of ``count`` workers keeps to, or None: one each, if they take all that this process may use.
+
+    Left alone, the scheduler often wakes two workers on one core while the other idles, for a good part of a step.
+    """
+    available = _available_cores()
+    return [*available] if len(available) == count > 1 and hasattr(os, "sched_setaffinity") else [None] * count
+
+
+def _settle(core: int | None) -> None:
+    """Keeps this process to a core, and makes it wait for the parent to have told every worker to start."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    if hasattr(os, "SCHED_BATCH"):  # such a process does not preempt the one that wakes it
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _bytes(shape: tuple[int, ...], dtype: type) -> int:
@@ -279,8 +308,11 @@ def _views(raw: Mapping[str, Any], num_envs: int) -> dict[str, NDArray]:
     }
 
 
-def _work(pipe: Any, parent: Any, raw: Any, num_envs: int, part: slice, settings: BatchSettings) -> None:
+def _work(
+    pipe: Any, parent: Any, raw: Any, num_envs: int, part: slice, settings: BatchSettings, core: int | None
+) -> None:
     """A worker: builds its scenes, then answers requests until the parent stops it or goes away."""
+    _settle(core)
     parent.close()  # or the pipe would not break when the parent dies
     try:
         arrays = {name: view[part] for name, view in _views(raw, num_envs).items()}

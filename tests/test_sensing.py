@@ -14,8 +14,9 @@ from tslam_bench.assets.store import SignedDistanceField
 from tslam_bench.constants import TOUCH_DISTANCE
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
+from tslam_bench.tasks.compiled_sensing import CompiledSensing
 from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, FieldAtlas, TactileSensing
-from tslam_bench.tasks.skin import build_skin
+from tslam_bench.tasks.skin import Skin, build_skin
 
 RADIUS, OFFSET = 0.05, np.array([0.02, -0.01, 0.015])
 
@@ -46,17 +47,25 @@ def random_links(generator: np.random.Generator, num_envs: int) -> np.ndarray:
     return matrices
 
 
+def arrays(num_envs: int, skin: Skin) -> TactileSensing:
+    return TactileSensing(num_envs, skin, NumpyBackend())
+
+
 def make(backend, skin, poses, fields):
-    sensing = TactileSensing(len(poses), skin, backend)
+    return put(TactileSensing(len(poses), skin, backend), poses, fields)
+
+
+def put(sensing, poses, fields):
     for env, (pose, (name, field)) in enumerate(zip(poses, fields, strict=True)):
         sensing.set_object(env, name, field, pose)
     sensing.begin(range(len(poses)))
     return sensing
 
 
+@pytest.mark.parametrize("kind", [arrays, CompiledSensing])
 @pytest.mark.parametrize("pose", range(8))
-def test_touch_and_contact_points_on_a_sphere(skin, pose):
-    sensing = make(NumpyBackend(), skin, [pose], [("sphere", sphere_field())])
+def test_touch_and_contact_points_on_a_sphere(skin, pose, kind):
+    sensing = put(kind(1, skin), [pose], [("sphere", sphere_field())])
     centre = grids.pose_rotation(pose) @ OFFSET
     matrices = random_links(np.random.default_rng(pose), 1)
     contacts = sensing.step(matrices, np.array([1]))
@@ -83,9 +92,10 @@ def test_touch_and_contact_points_on_a_sphere(skin, pose):
     np.testing.assert_array_equal(sensing.link_touch()[0], links)
 
 
-def test_grids_accumulate_like_python_sets(skin):
+@pytest.mark.parametrize("kind", [arrays, CompiledSensing])
+def test_grids_accumulate_like_python_sets(skin, kind):
     num_envs, generator = 3, np.random.default_rng(5)
-    sensing = make(NumpyBackend(), skin, [0, 3, 6], [("sphere", sphere_field())] * num_envs)
+    sensing = put(kind(num_envs, skin), [0, 3, 6], [("sphere", sphere_field())] * num_envs)
     visited = [set() for _ in range(num_envs)]
     on_before = np.zeros((num_envs, len(skin.probes)), dtype=bool)
     touched_before = np.zeros(num_envs, dtype=int)
@@ -139,6 +149,34 @@ def test_torch_agrees_with_numpy_and_any_batch_gives_the_same_bits(skin):
         for name in ("touched", "visited", "touched_step", "on"):
             np.testing.assert_array_equal(getattr(batch, name), getattr(tensors, name).numpy(), err_msg=name)
         np.testing.assert_array_equal(batch.link_touch(), tensors.link_touch().numpy())
+
+
+def test_compiled_loops_give_the_bits_of_the_array_code(skin):
+    """Random links and fields, several episodes: every output and every grid, bit for bit."""
+    num_envs, generator = 6, np.random.default_rng(9)
+    poses = [0, 2, 5, 7, 1, 4]
+    fields = [("large", sphere_field(0.06, 2e-3)), ("small", sphere_field(0.03, 1.5e-3))]
+    chosen = [fields[env % 2] for env in range(num_envs)]
+    occupancy = np.zeros((num_envs, 2, 32, 32, 32), dtype=np.uint8)
+    plain = put(arrays(num_envs, skin), poses, chosen)
+    compiled = put(CompiledSensing(num_envs, skin, occupancy), poses, chosen)
+    felt = 0
+    for step in range(12):
+        if step == 7:
+            for sensing in (plain, compiled):
+                sensing.begin([1, 4])
+        matrices = random_links(generator, num_envs)
+        np.testing.assert_array_equal(plain.touches(matrices), compiled.touches(matrices))
+        a, b = (sensing.step(matrices, np.full(num_envs, step)) for sensing in (plain, compiled))
+        felt += int(a.on.sum())
+        for name in ("on", "new", "points", "mask", "new_touched", "new_visited"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        for name in ("touched", "visited", "touched_step", "on"):
+            np.testing.assert_array_equal(getattr(plain, name), getattr(compiled, name), err_msg=name)
+        np.testing.assert_array_equal(plain.link_touch(), compiled.link_touch())
+    assert felt > 1000
+    np.testing.assert_array_equal(occupancy[:, 0].view(bool), compiled.touched)
+    np.testing.assert_array_equal(occupancy[:, 1].view(bool), compiled.visited)
 
 
 def test_the_device_path_covers_every_probe_and_agrees(skin):

@@ -65,12 +65,18 @@ class EvaluateArguments:
     """Repetitions; each is 8 episodes per object."""
     reconstructors: tuple[str, ...] = ("grid", "hull")
     """Reconstructors, as ID or ID=MODEL for learned ones; ``none`` only explores."""
+    learning_objects: tuple[str, ...] = ()
+    """Train objects that mean_shape and retrieval are built from; empty: all that are prepared."""
     output: Path = Path("runs/evaluation")
     """Folder for rollouts/ and submissions/."""
     deterministic: bool = False
     """A learned explorer acts by the mean of its policy instead of sampling."""
     label: str = ""
     """Remark shown beside every figure."""
+    processes: int | None = None
+    """Worker processes that simulate; default: the cores. Results do not depend on it."""
+    torch_threads: int = 1
+    """Threads of torch. One is fastest on CPUs: a policy's small tensors are not worth sharing out."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -125,7 +131,9 @@ def _evaluate(arguments: list[str]) -> None:
 
     from tslam_bench.baselines.evaluate import EvaluationConfig, default_objects, evaluate, make_reconstructors
 
-    torch.set_num_threads(1)  # one observation at a time: more threads only wait for each other
+    if parsed.torch_threads < 1:
+        raise InvalidInputError(f"torch_threads {parsed.torch_threads}: must be at least 1")
+    torch.set_num_threads(parsed.torch_threads)
     config = EvaluationConfig(
         baseline=spec.id,
         objects=parsed.objects or default_objects(parsed.object_set),
@@ -134,6 +142,7 @@ def _evaluate(arguments: list[str]) -> None:
         model=parsed.model,
         deterministic=parsed.deterministic,
         label=parsed.label,
+        processes=parsed.processes,
     )
     bars: dict[str, tqdm] = {}
 
@@ -144,7 +153,9 @@ def _evaluate(arguments: list[str]) -> None:
         if done == total:
             bars[stage].close()
 
-    submissions = evaluate(config, make_reconstructors(parsed.reconstructors), parsed.output, show)
+    submissions = evaluate(
+        config, make_reconstructors(parsed.reconstructors, parsed.learning_objects), parsed.output, show
+    )
     for submission in submissions:
         print(submission)
 

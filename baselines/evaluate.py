@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 import tslam_bench
 from tslam_bench.assets.store import asset_sha256, known_names, load_object, resolve_name
 from tslam_bench.baselines.registry import BaselineSpec, get_baseline, make_baseline
-from tslam_bench.baselines.rollout import Rollout, roll_out
+from tslam_bench.baselines.rollout import Rollout, roll_out_batch
 from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
@@ -36,6 +35,8 @@ from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Reconstructor
 
 SOURCE_FILE: Final = "source.json"
+SIDE_BY_SIDE: Final = 8
+"""Episodes that are rolled out at a time."""
 Grid = NDArray[np.bool_]
 Grids = tuple[Grid, Grid]
 """Touched and visited."""
@@ -53,6 +54,7 @@ class EvaluationConfig:
         model: directory of the trained model of a learned baseline.
         deterministic: a learned baseline acts by the mean of its policy.
         label: remark that is shown beside every figure of the submission.
+        processes: worker processes that simulate; None means the cores. Results do not depend on it.
     """
 
     baseline: str
@@ -62,6 +64,7 @@ class EvaluationConfig:
     model: Path | None = None
     deterministic: bool = False
     label: str = ""
+    processes: int | None = None
 
     def __post_init__(self) -> None:
         get_baseline(self.baseline)
@@ -77,8 +80,12 @@ def default_objects(object_set: str) -> tuple[str, ...]:
     return QUICK_OBJECTS if object_set == "quick" else tuple(known_names("test"))
 
 
-def make_reconstructors(specifications: Sequence[str]) -> dict[str, Reconstructor]:
+def make_reconstructors(
+    specifications: Sequence[str], learning_objects: Sequence[str] = ()
+) -> dict[str, Reconstructor]:
     """Reconstructors by id, from ``ID`` or, for those that have learned, ``ID=MODEL``; ``none`` alone gives none.
+
+    ``learning_objects`` names the train objects that ``mean_shape`` and ``retrieval`` are built from; empty: all prepared.
 
     Raises:
         InvalidInputError: unknown id, a model that is missing or unreadable, or one id twice.
@@ -90,7 +97,7 @@ def make_reconstructors(specifications: Sequence[str]) -> dict[str, Reconstructo
         name, _, model = specification.partition("=")
         if name in reconstructors:
             raise InvalidInputError(f"reconstructor {name!r}: given twice")
-        reconstructors[name] = make_reconstructor(name, Path(model) if model else None)
+        reconstructors[name] = make_reconstructor(name, Path(model) if model else None, objects=learning_objects)
     return reconstructors
 
 
@@ -152,13 +159,16 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
     report("explore", len(episodes) - len(missing), len(episodes))
     if not missing:
         return
-    env = gym.make(ENVIRONMENT_ID, split="test", render_backend="none")
+    width, done = min(SIDE_BY_SIDE, len(missing)), len(episodes) - len(missing)
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, width, "cpu", objects=config.objects, processes=config.processes)
     try:
-        for done, (name, pose, seed) in enumerate(missing, start=len(episodes) - len(missing) + 1):
-            roll_out(env, baseline, name, pose, seed).save(episode_path(folder, name, pose, seed))
-            report("explore", done, len(episodes))
+        for first in range(0, len(missing), width):
+            for rollout in roll_out_batch(envs, baseline, missing[first : first + width]):
+                rollout.save(episode_path(folder, rollout.object, rollout.pose, rollout.seed))
+                done += 1
+                report("explore", done, len(episodes))
     finally:
-        env.close()
+        envs.close()
 
 
 def episode_path(folder: Path, object_name: str, pose: int, seed: int) -> Path:

@@ -96,15 +96,21 @@ class LearnedBaseline:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
         check_observation(observation, len(self._generators))
         with torch.inference_mode():
-            tensors = {key: torch.from_numpy(np.ascontiguousarray(observation[key])) for key in self._keys}
-            features = self._policy.pi_features_extractor(tensors)
-            actions = self._policy.action_net(self._policy.mlp_extractor.forward_actor(features)).numpy()
+            # One at a time: the bits of a batched product depend on the batch, an episode must not.
+            rows = [self._mean_action(observation, row) for row in range(len(self._generators))]
+            actions = np.concatenate(rows)
         if not self._deterministic:
             if self._step == HORIZON:
                 self._draw()
             actions = actions + self._deviation * self._noise[:, self._step]
             self._step += 1
         return np.clip(actions, -1, 1).astype(np.float32)
+
+    def _mean_action(self, observation: Mapping[str, NDArray], row: int) -> NDArray[np.float32]:
+        """(1, 28) mean of the policy for one episode's observation."""
+        tensors = {key: torch.from_numpy(np.ascontiguousarray(observation[key][row : row + 1])) for key in self._keys}
+        features = self._policy.pi_features_extractor(tensors)
+        return self._policy.action_net(self._policy.mlp_extractor.forward_actor(features)).numpy()
 
     @property
     def _keys(self) -> list[str]:

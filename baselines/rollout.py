@@ -1,12 +1,15 @@
-"""One evaluation episode: a baseline explores one object in one pose (protocol sections 4 to 6)."""
+"""Evaluation episodes: a baseline explores objects in poses (protocol sections 4 to 6)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from tslam_bench.baselines.interface import Baseline
@@ -126,3 +129,48 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         to_numpy(base.touched_step)[0].astype(np.int16),  # type: ignore[attr-defined]
         episode_return,
     )
+
+
+def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[tuple[str, int, int]]) -> list[Rollout]:
+    """Lets ``baseline`` explore several (object, pose, seed) side by side.
+
+    Bit for bit what :func:`roll_out` gives for each of them.
+
+    Args:
+        envs: what ``tslam_bench.make_vec`` returned.
+        baseline: the policy; it is reset here.
+        episodes: at most ``envs.num_envs`` of them.
+
+    Raises:
+        InvalidInputError: too many episodes or none, unknown object or pose, or episodes that do not end after 200 steps.
+    """
+    count = len(episodes)
+    if not 0 < count <= envs.num_envs:
+        raise InvalidInputError(f"episodes: {count} given for {envs.num_envs} environments; give 1 to {envs.num_envs}")
+    filled = [*episodes, *[episodes[-1]] * (envs.num_envs - count)]  # idle environments repeat the last one
+    starts: Any = [episode_seed(name, pose, seed) for name, pose, seed in filled]  # Gymnasium's type is one number
+    baseline.reset(envs.num_envs, starts)
+    options = {"object": [name for name, _, _ in filled], "pose": [pose for _, pose, _ in filled]}
+    raw, _ = envs.reset(seed=starts, options=options)
+    actions = np.zeros((HORIZON, envs.num_envs, NUM_JOINTS), dtype=np.float32)
+    episode_return = [0.0] * envs.num_envs
+    touched_step = np.full((envs.num_envs, *_GRID_SHAPE), -1, dtype=np.int16)
+    for step in range(HORIZON):
+        actions[step] = baseline.act(observation_to_numpy(raw))
+        raw, reward, terminated, truncated, info = envs.step(actions[step])
+        ended = to_numpy(terminated) | to_numpy(truncated)
+        if ended.any() != (step == HORIZON - 1) or ended.any() != ended.all():
+            raise InvalidInputError(f"environment: an episode ended after {step + 1} steps, expected {HORIZON}")
+        seen = info["final_obs"] if ended.any() else raw
+        occupancy = to_numpy(seen["occupancy"]).astype(bool)
+        touched_step[occupancy[:, 0] & (touched_step < 0)] = step
+        for env, value in enumerate(to_numpy(reward).tolist()):
+            episode_return[env] += value
+    rollouts = []
+    for env, (name, pose, seed) in enumerate(episodes):
+        touched, visited = occupancy[env]
+        taken = actions[:, env].copy()
+        rollouts.append(
+            Rollout(name, check_pose(pose), int(seed), taken, touched, visited, touched_step[env], episode_return[env])
+        )
+    return rollouts

@@ -12,13 +12,14 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
 import tyro
 from tqdm import tqdm
 
-from tslam_bench.assets.store import asset_sha256, known_names
+from tslam_bench.assets.store import asset_sha256, known_names, list_objects
 from tslam_bench.baselines.jobs import Job, JobRunner
 from tslam_bench.baselines.registry import get_baseline, list_baselines
 from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
@@ -27,6 +28,8 @@ from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.leaderboard.submission import INFO_FILE
 from tslam_bench.reconstruction.registry import get_reconstructor
 
+_ONE_PROCESS: Final = ("--processes", "1")
+"""Jobs run side by side, so each simulates in one process."""
 _TEST_ASSETS: Final = "assets-test"
 """Job that prepares the test objects and the hand."""
 ALL_BASELINES: Final = tuple(spec.id for spec in list_baselines())
@@ -44,8 +47,8 @@ class RunSettings:
         seeds: repetitions of every episode.
         steps: training steps of each learned baseline.
         training: further arguments of ``tslam-bench baselines train``.
-        learning_objects: (split, arguments of ``tslam-bench assets prepare``) of the objects to learn from; the
-            reconstructors' thresholds are fixed on val, or on train while there is none.
+        learning_objects: (split, names) of the objects to learn from; no names: the split's default set, whole. The
+            reconstructors' thresholds are fixed on val, or on train while val is not listed.
         reconstructors: ids; learned ones are trained first.
         reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
         remark: shown beside the figures of learned baselines.
@@ -68,7 +71,42 @@ _SMALL_TRAINING: Final = (
     *("--network", "small", "--num-envs", "4", "--rollout-steps", "200", "--batch-size", "200", "--epochs", "4"),
     *("--checkpoint-every", "1600"),
 )
-_GENERATED: Final = ("--source", "generated", "--count")
+QUICK_TRAINING_OBJECTS: Final = (
+    "bottle-000",
+    "bowl-000",
+    "tumbler-000",
+    "goblet-000",
+    "mug-000",
+    "frying-pan-000",
+    "cooking-pot-000",
+    "teapot-000",
+    "plate-000",
+    "jar-000",
+    "candlestick-000",
+    "mallet-000",
+    "screwdriver-000",
+    "spoon-000",
+    "wrench-000",
+    "paint-brush-000",
+    "key-000",
+    "comb-000",
+    "carton-000",
+    "remote-control-000",
+    "toaster-000",
+    "book-000",
+    "bangle-000",
+    "picture-frame-000",
+)
+"""Generated train objects of the quick run, by name: what else is prepared must not change its results."""
+QUICK_VALIDATION_OBJECTS: Final = (
+    "bucket-000",
+    "mushroom-000",
+    "rocket-000",
+    "cogwheel-000",
+    "trophy-000",
+    "bench-000",
+)
+"""Generated val objects on which the quick run fixes thresholds."""
 PRESETS: Final[dict[str, RunSettings]] = {
     "quick": RunSettings(
         name="quick",
@@ -78,7 +116,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         seeds=(0,),
         steps=4000,
         training=_SMALL_TRAINING,
-        learning_objects=(("train", (*_GENERATED, "24")), ("val", (*_GENERATED, "6"))),
+        learning_objects=(("train", QUICK_TRAINING_OBJECTS), ("val", QUICK_VALIDATION_OBJECTS)),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "300"),
         remark="proves the path, not the method",
@@ -102,7 +140,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
             "--epochs",
             "1",
         ),
-        learning_objects=(("train", (*_GENERATED, "2")),),
+        learning_objects=(("train", QUICK_TRAINING_OBJECTS[:2]),),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
         remark="shows that everything runs, nothing else",
@@ -202,7 +240,7 @@ def plan(settings: RunSettings, output: Path, workers: int) -> list[Job]:
 
 
 def _objects(settings: RunSettings) -> Command:
-    return ("--objects", *settings.objects) if settings.objects else ()
+    return _listed("--objects", settings.objects)
 
 
 def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
@@ -216,10 +254,20 @@ def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
 
     command = (*prepare, *test_objects, *several)
     jobs = [Job(_TEST_ASSETS, command, slots=workers, always=True, fingerprint=test_assets)]
-    for split, arguments in settings.learning_objects:
-        command = (*prepare, "--split", split, *arguments, *several)
-        jobs.append(Job(f"assets-{split}", command, slots=workers, always=True))
+    for split, names in settings.learning_objects:
+        command = (*prepare, "--split", split, *_listed("--objects", names), *several)
+        fingerprint = partial(_learning_sha256, split, names)
+        jobs.append(Job(f"assets-{split}", command, slots=workers, always=True, fingerprint=fingerprint))
     return jobs
+
+
+def _learning_sha256(split: str, names: Sequence[str]) -> str:
+    """Hash of the names and products of what is learned from."""
+    return asset_sha256(names or [record["name"] for record in list_objects(split)], split)
+
+
+def _listed(flag: str, names: Sequence[str]) -> Command:
+    return (flag, *names) if names else ()
 
 
 def _learning_assets(settings: RunSettings) -> tuple[str, ...]:
@@ -238,15 +286,25 @@ def _models(settings: RunSettings, output: Path) -> dict[str, Path]:
 
 def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
     jobs = []
+    learning = dict(settings.learning_objects)
+    held_out = "val" if "val" in learning else "train"
+    threshold = ("--threshold-split", held_out, *_listed("--threshold-objects", learning[held_out]))
     for name, model in _models(settings, output).items():
         command: Command = ("tslam-bench", "reconstruct", "train", "--architecture", name)
+        command += (*_listed("--objects", learning["train"]), *threshold)
         command += (*settings.reconstruction_training, "--output", str(model))
         jobs.append(Job(f"train-{name}", command, _learning_assets(settings), (model,)))
     for name in settings.baselines:
         if get_baseline(name).kind == "learned":
             folder = output / "models" / name
             command = ("tslam-bench", "baselines", "train", name, "--steps", str(settings.steps))
-            command += (*settings.training, "--output", str(folder))
+            command += (
+                *_listed("--objects", learning["train"]),
+                *settings.training,
+                *_ONE_PROCESS,
+                "--output",
+                str(folder),
+            )
             jobs.append(Job(f"train-{name}", command, (_TEST_ASSETS, "assets-train"), (folder / METADATA_FILE,)))
     return jobs
 
@@ -265,10 +323,11 @@ def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
         specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
         command: Command = ("tslam-bench", "baselines", "evaluate", name, "--object-set", settings.object_set)
         command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
-        command += ("--reconstructors", *specifications, "--output", str(output))
+        command += ("--reconstructors", *specifications, *_ONE_PROCESS, "--output", str(output))
         after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
         if any(get_reconstructor(r).needs == "objects" for r in chosen):
             after.append("assets-train")
+            command += _listed("--learning-objects", dict(settings.learning_objects)["train"])
         if kind == "learned":
             label = f"{settings.name}: {settings.steps:,} steps" + (f", {settings.remark}" if settings.remark else "")
             command += ("--model", str(output / "models" / name), "--label", label)

@@ -18,10 +18,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -79,9 +79,8 @@ def train(
         if state["assets"] != assets:
             raise InvalidInputError(f"{output}: was begun with other objects; delete it or choose another output")
 
-    environments = make_training_environments(config)
     normalised = VecNormalize(
-        VecMonitor(TactileVecEnv(environments)),
+        VecMonitor(TactileVecEnv(make_training_environments(config))),
         norm_obs=False,
         norm_reward=True,
         gamma=config.gamma,
@@ -94,7 +93,7 @@ def train(
             model = _new_model(config, normalised)
             seconds_before, mean_return = 0.0, None
         else:
-            model = PPO.load(checkpoint / MODEL_FILE, env=normalised, device="cpu")
+            model = PPO.load(checkpoint / MODEL_FILE, env=normalised, device=learning_device(config))
             statistics = normalised.ret_rms
             statistics.mean, statistics.var = np.float64(state["return_mean"]), np.float64(state["return_variance"])
             statistics.count = state["return_count"]
@@ -141,13 +140,22 @@ def train(
     return metadata
 
 
-def make_training_environments(config: TrainingConfig) -> list[gym.Env]:
+def make_training_environments(config: TrainingConfig) -> VectorEnv:
     """The environments of a run: objects and poses drawn per episode."""
-    spec = get_baseline(config.baseline)
-    arguments: dict[str, Any] = {"split": config.split, "reward_mode": spec.reward_mode, "render_backend": "none"}
-    if config.objects:
-        arguments["objects"] = config.objects
-    return [gym.make(ENVIRONMENT_ID, **arguments) for _ in range(config.num_envs)]
+    return tslam_bench.make_vec(
+        ENVIRONMENT_ID,
+        config.num_envs,
+        config.device,
+        objects=config.objects or None,
+        split=config.split,
+        reward_mode=get_baseline(config.baseline).reward_mode or "none",
+        processes=config.processes,
+    )
+
+
+def learning_device(config: TrainingConfig) -> str:
+    """``cpu`` or ``cuda``: where ``make_vec`` simulates, there the network learns."""
+    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def machine_description() -> dict[str, Any]:
@@ -187,7 +195,7 @@ def _new_model(config: TrainingConfig, environments: VecNormalize) -> PPO:
         ent_coef=config.entropy_coefficient,
         policy_kwargs=policy_arguments(NETWORKS[config.network], limits),
         seed=config.seed,
-        device="cpu",
+        device=learning_device(config),
     )
 
 
@@ -196,6 +204,10 @@ def _learn_chunk(model: PPO, config: TrainingConfig, steps: int, on_progress: Ca
     chunk_seed = int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]) >> 1
     model.set_random_seed(chunk_seed)  # torch, numpy (minibatches), and the environments' next reset
     model._last_obs = None  # makes `learn` reset the environments
+    assert model.env is not None
+    model.env.set_options(
+        {"reconfigure": True}
+    )  # a GPU scene draws other objects then; the CPU does so at every episode
     callback = _Progress(on_progress) if on_progress else None
     model.learn(total_timesteps=steps, callback=callback, log_interval=1, reset_num_timesteps=False)
 
@@ -252,7 +264,8 @@ def _plain(config: TrainingConfig) -> dict[str, Any]:
 
 def _check_same_settings(config: TrainingConfig, found: dict[str, Any], output: Path) -> None:
     here = _plain(config)
-    different = sorted(key for key in here.keys() | found.keys() if here.get(key) != found.get(key))
+    compared = (here.keys() | found.keys()) - {"processes"}  # bits do not depend on it
+    different = sorted(key for key in compared if here.get(key) != found.get(key))
     if different:
         pairs = ", ".join(f"{key} {found.get(key)!r} there, {here.get(key)!r} here" for key in different)
         raise InvalidInputError(

@@ -58,6 +58,10 @@ class TrainingConfig:
     """Weight of the entropy bonus."""
     checkpoint_every: int = 64_000
     """Steps between checkpoints; rounded up to whole PPO iterations."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to simulate and learn; auto: on a CUDA GPU where there is one (not run on a GPU yet)."""
+    processes: int | None = None
+    """Worker processes that simulate on the CPU; default: the cores. Results do not depend on it."""
     torch_threads: int = 1
     """Threads of torch. One is fastest on CPUs: with two, the learner was measured more than ten times slower."""
 
@@ -69,6 +73,8 @@ class TrainingConfig:
         for name in ("steps", "num_envs", "rollout_steps", "batch_size", "epochs", "checkpoint_every", "torch_threads"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
+        if self.processes is not None and self.processes < 1:
+            raise InvalidInputError(f"processes {self.processes}: must be at least 1")
         if self.seed < 0:
             raise InvalidInputError(f"seed {self.seed}: must not be negative")
         if self.num_envs * self.rollout_steps < 2:

@@ -1,32 +1,37 @@
-"""A batched environment for tests of the adapter and the learner: ``from counting_environment import Counter``."""
+"""A vector environment for tests of the adapter and the learner: ``from counting_environment import Counter``."""
 
 from __future__ import annotations
 
-import gymnasium as gym
+from typing import Any
+
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
 
-class Counter(gym.Env):
-    """Batched like ManiSkill. Row i counts its steps, ends after ``lengths[i]`` of them, and pays its step count.
+class Counter(VectorEnv):
+    """Environment i counts its steps, ends after ``lengths[i]`` of them, and pays its step count.
 
-    Its observation buffers are overwritten in place at each step and reset, as a simulator's may be.
+    Its observation buffers are overwritten in place at each step and reset, as a simulator's may be; they are torch
+    tensors or numpy arrays.
     """
 
-    def __init__(self, lengths: tuple[int, ...], terminates: bool = False) -> None:
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, lengths: tuple[int, ...], terminates: bool = False, tensors: bool = True) -> None:
         self.num_envs = len(lengths)
         self.lengths = torch.tensor(lengths)
-        self.terminates = terminates
-        self.single_observation_space = spaces.Dict(
+        self.terminates, self.tensors = terminates, tensors
+        self.set_spaces(
             {
                 "qpos": spaces.Box(-np.inf, np.inf, (2,), np.float32),  # seed of the first reset, step
                 "occupancy": spaces.Box(0, 1, (1, 2, 2, 2), np.uint8),
                 "touch": spaces.Box(0, 1, (1,), bool),
-            }
+            },
+            3,
         )
-        self.single_action_space = spaces.Box(-1, 1, (3,), np.float32)
-        self.observation_space, self.action_space = self.single_observation_space, self.single_action_space
         self.seeds = torch.zeros(self.num_envs)
         self.steps = torch.zeros(self.num_envs, dtype=torch.long)
         self.buffers = {
@@ -35,33 +40,49 @@ class Counter(gym.Env):
             "touch": torch.zeros(self.num_envs, 1, dtype=torch.bool),
         }
         self.last_actions: torch.Tensor | None = None
-        self.closed = False
+        self.was_closed = False
+
+    def set_spaces(self, observations: dict[str, spaces.Space], actions: int) -> None:
+        self.single_observation_space = spaces.Dict(observations)
+        self.single_action_space = spaces.Box(-1, 1, (actions,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def _observe(self):
         self.buffers["qpos"][:, 0] = self.seeds
         self.buffers["qpos"][:, 1] = self.steps.float()
         self.buffers["occupancy"][:] = (self.steps % 2).to(torch.uint8)[:, None, None, None, None]
-        return self.buffers
+        return self.buffers if self.tensors else {key: value.numpy() for key, value in self.buffers.items()}
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
             self.seeds = torch.as_tensor(seed).float().reshape(-1).expand(self.num_envs).clone()
-        index = (options or {}).get("env_idx", torch.arange(self.num_envs))
-        self.steps[index] = 0
+        self.steps[:] = 0
         return self._observe(), {}
+
+    def pay(self) -> torch.Tensor:
+        return self.steps.double()
 
     def step(self, action):
         self.last_actions = torch.as_tensor(action)
-        assert self.last_actions.shape == (self.num_envs, 3)
+        assert self.last_actions.shape == self.action_space.shape
         self.steps += 1
         ended = self.steps >= self.lengths
-        never = torch.zeros_like(ended)
-        info = {"elapsed": self.steps.clone()}
+        reward, never = self.pay(), torch.zeros_like(ended)
+        info: dict[str, Any] = {"elapsed": self.steps.clone()}
+        if ended.any():
+            final = {key: value.clone() for key, value in self._observe().items()} if self.tensors else None
+            info["final_obs"] = final or {key: value.copy() for key, value in self._observe().items()}
+            info["final_info"] = {"elapsed": self.steps.clone()}
+            info["_final_obs"] = info["_final_info"] = ended
+            self.steps[ended] = 0
         terminated, truncated = (ended, never) if self.terminates else (never, ended)
-        return self._observe(), self.steps.double(), terminated, truncated, info
+        if self.tensors:
+            return self._observe(), reward, terminated, truncated, info
+        return self._observe(), reward.numpy(), terminated.numpy(), truncated.numpy(), info
 
     def double(self, x):
         return 2 * x
 
-    def close(self):
-        self.closed = True
+    def close_extras(self, **kwargs):
+        self.was_closed = True

@@ -136,7 +136,7 @@ def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> Non
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("kind", ["random", "heuristic"])
+@pytest.mark.parametrize("kind", ["random", "heuristic", "learned", "learned mean"])
 def test_an_episode_does_not_depend_on_its_batch(kind: str, policy) -> None:
     together = moving_hand(make(kind, policy), [11, 12, 13], 60)
     alone = moving_hand(make(kind, policy), [12], 60)

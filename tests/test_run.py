@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tslam_bench import cli
+from tslam_bench.assets.generate import candidates
 from tslam_bench.baselines.jobs import Job, JobError, JobRunner
 from tslam_bench.baselines.registry import list_baselines
 from tslam_bench.baselines.run import PRESETS, Arguments, plan, settings_of
@@ -66,6 +67,31 @@ def test_quick_run_is_what_it_promises(tmp_path: Path) -> None:
             assert "4,000 steps, proves the path, not the method" in command
     assert tmp_path / "leaderboard.json" in jobs["leaderboard"].outputs
     assert tmp_path / "index.html" in jobs["leaderboard"].outputs
+
+
+def test_what_is_learned_from_is_named(tmp_path: Path) -> None:
+    """What else the cache holds must not change a quick run; a full one leaves the hash of what it found."""
+    jobs = {job.name: job for job in plan(PRESETS["quick"], tmp_path, 2)}
+    generated = {split: {source.name for source in candidates(split, rounds=3)} for split in ("train", "val")}
+    train, val = (dict(PRESETS["quick"].learning_objects)[split] for split in ("train", "val"))
+    assert set(train) <= generated["train"] and len(set(train)) == 24
+    assert set(val) <= generated["val"] and len(set(val)) == 6
+    for name, flag, names in (
+        ("assets-train", "--objects", train),
+        ("assets-val", "--objects", val),
+        ("train-ifnet", "--objects", train),
+        ("train-ifnet", "--threshold-objects", val),
+        ("train-tslam", "--objects", train),
+        ("evaluate-nothing", "--learning-objects", train),
+    ):
+        command = jobs[name].command
+        first = command.index(flag) + 1
+        assert command[first : first + len(names)] == names
+        assert all(word.startswith("--") for word in command[first + len(names) : first + len(names) + 1])
+    tiny = {job.name: job for job in plan(PRESETS["tiny"], tmp_path, 2)}["train-ifnet"].command
+    assert "--threshold-split train --threshold-objects bottle-000" in shlex.join(tiny)
+    for job in plan(PRESETS["full"], tmp_path, 2):
+        assert (job.fingerprint is not None) == job.name.startswith("assets-")
 
 
 def test_flags_change_the_preset(tmp_path: Path) -> None:

@@ -9,9 +9,11 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from baseline_assets import SHAPES, primitive_cache
+from test_baselines import METADATA
 
-import tslam_bench  # noqa: F401  (registers the environments)
+import tslam_bench
 from tslam_bench.baselines.evaluate import (
     EvaluationConfig,
     episode_path,
@@ -20,8 +22,9 @@ from tslam_bench.baselines.evaluate import (
     merged_grids,
     reference_grids,
 )
+from tslam_bench.baselines.learned import LearnedBaseline, build_policy
 from tslam_bench.baselines.registry import make_baseline
-from tslam_bench.baselines.rollout import Rollout, roll_out
+from tslam_bench.baselines.rollout import Rollout, roll_out, roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
 from tslam_bench.episodes import episode_seed
 from tslam_bench.errors import InvalidInputError
@@ -124,6 +127,27 @@ def test_equal_arguments_give_equal_episodes_in_a_new_environment(rollouts) -> N
     assert np.array_equal(again.touched_step, rollouts[3].touched_step)
     assert again.episode_return == rollouts[3].episode_return
     assert not np.array_equal(other.actions, again.actions)
+
+
+@pytest.mark.parametrize("identifier", ["heuristic", "random", "learned"])
+def test_batches_of_episodes_are_bit_for_bit_those_of_gym_make(identifier: str) -> None:
+    """The CPU vector environment that evaluation uses, against one ManiSkill environment; five episodes in threes."""
+    torch.manual_seed(1)
+    torch.set_num_threads(1)
+    explorer = LearnedBaseline(build_policy(METADATA)) if identifier == "learned" else make_baseline(identifier)
+    episodes = [("phone", 0, 0), ("cubelarge", 5, 0), ("phone", 3, 1), ("cubelarge", 2, 4), ("phone", 6, 0)]
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", processes=2)
+    batched = [r for first in (0, 3) for r in roll_out_batch(envs, explorer, episodes[first : first + 3])]
+    with pytest.raises(InvalidInputError, match="4 given for 3 environments"):
+        roll_out_batch(envs, explorer, episodes[:4])
+    envs.close()
+    env = gym.make(ENVIRONMENT_ID, render_backend="none")
+    assert sum(rollout.touched.sum() for rollout in batched) > 0
+    for rollout, episode in zip(batched, episodes, strict=True):
+        single = roll_out(env, explorer, *episode)
+        for name, value in vars(single).items():
+            assert np.array_equal(getattr(rollout, name), value), (episode, name)
+    env.close()
 
 
 def test_heuristic_touches_much_more_than_random(rollouts) -> None:

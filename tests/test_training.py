@@ -37,6 +37,7 @@ CONFIG = TrainingConfig(
     epochs=2,
     network="small",
     checkpoint_every=40,
+    processes=1,
 )
 
 
@@ -187,13 +188,31 @@ def test_output_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_objects_restrict_the_draw(cache) -> None:
-    environments = training.make_training_environments(replace(CONFIG, objects=("plate",), num_envs=1))
+    environments = training.make_training_environments(replace(CONFIG, objects=("plate",), num_envs=4))
     try:
-        for seed in range(4):
-            environments[0].reset(seed=seed)
-            assert environments[0].unwrapped.object_name == ["plate"]
+        environments.reset(seed=0)
+        assert environments.state()["object_name"] == ["plate"] * 4
     finally:
-        environments[0].close()
+        environments.close()
+
+
+def test_the_number_of_processes_changes_nothing(straight: Path, tmp_path: Path) -> None:
+    train(replace(CONFIG, processes=2), tmp_path)
+    for one, other in zip(weights(straight), weights(tmp_path), strict=True):
+        assert torch.equal(one, other)
+    assert train(replace(CONFIG, processes=1), tmp_path)["steps"] == 120  # no other settings: nothing to refuse
+
+
+def test_torch_threads_are_one_unless_asked_for(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        for asked, expected in ((None, 1), (2, 2)):
+            torch.set_num_threads(3)
+            config = replace(CONFIG, steps=40) if asked is None else replace(CONFIG, steps=40, torch_threads=asked)
+            train(config, tmp_path / str(asked))
+            assert torch.get_num_threads() == expected
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_rounding_of_budgets() -> None:
@@ -212,8 +231,7 @@ def test_learner_improves_where_improving_is_easy(tmp_path: Path) -> None:
             shapes = {"qpos": (28,), "qvel": (28,), "touch": (18,), "time": (1,)}
             entries = {key: spaces.Box(-np.inf, np.inf, shape, np.float32) for key, shape in shapes.items()}
             entries["occupancy"] = spaces.Box(0, 1, (2, 32, 32, 32), np.uint8)
-            self.single_observation_space = self.observation_space = spaces.Dict(entries)
-            self.single_action_space = self.action_space = spaces.Box(-1, 1, (28,), np.float32)
+            self.set_spaces(entries, 28)
             self.zeros = {
                 key: torch.zeros(8, *space.shape, dtype=torch.uint8 if space.dtype == np.uint8 else torch.float32)
                 for key, space in entries.items()
@@ -222,13 +240,12 @@ def test_learner_improves_where_improving_is_easy(tmp_path: Path) -> None:
         def _observe(self):
             return self.zeros
 
-        def step(self, action):
-            self.steps += 1
-            ended = self.steps >= self.lengths
-            return self._observe(), torch.as_tensor(action).mean(dim=1), torch.zeros_like(ended), ended, {}
+        def pay(self):
+            assert self.last_actions is not None
+            return self.last_actions.mean(dim=1)
 
     torch.set_num_threads(1)
-    environments = VecNormalize(VecMonitor(TactileVecEnv([PaysForClosing()])), norm_obs=False)
+    environments = VecNormalize(VecMonitor(TactileVecEnv(PaysForClosing())), norm_obs=False)
     config = replace(CONFIG, num_envs=8, rollout_steps=20, batch_size=40, epochs=5, learning_rate=1e-3)
     model = training._new_model(config, environments)
     returns = []

@@ -1,15 +1,20 @@
-"""The adapter to stable-baselines3, on a small batched environment whose observations say where they come from."""
+"""The stable-baselines3 adapter: ends of episodes, copies, kinds and seeds, on counters and on the real environment."""
 
 from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from counting_environment import Counter
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
+import tslam_bench
 from tslam_bench.baselines.vector import TactileVecEnv
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 
 
@@ -17,55 +22,62 @@ def act(vec: TactileVecEnv, value: float = 0.0):
     return vec.step(np.full((vec.num_envs, 3), value, dtype=np.float32))
 
 
-@pytest.mark.parametrize("layout", [[(3,), (3,), (3,)], [(3, 3, 3)], [(3, 3), (3,)]])
-def test_layouts_agree(layout) -> None:
-    """Single environments, one batch, and a mixture are the same to the learner."""
-    vec = TactileVecEnv([Counter(lengths) for lengths in layout], seed=7)
-    first = vec.reset()
-    assert first["qpos"][:, 0].tolist() == [7, 8, 9]
-    for step in (1, 2, 3, 1):
-        observation, rewards, dones, infos = act(vec)
-        assert rewards.tolist() == [step] * 3
-        assert dones.tolist() == [step == 3] * 3
-        shown = 0 if step == 3 else step  # after the end comes the next episode's first observation
-        assert observation["qpos"][:, 1].tolist() == [shown] * 3
-        assert len(infos) == 3
-
-
 def test_terminal_observation_is_the_last_one_and_a_copy() -> None:
-    vec = TactileVecEnv([Counter((2, 3))])
-    vec.reset()
-    act(vec)
-    observation, _, dones, infos = act(vec)
-    assert dones.tolist() == [True, False]
-    assert "terminal_observation" not in infos[1]
-    terminal = infos[0]["terminal_observation"]
-    assert terminal["qpos"][1] == 2 and observation["qpos"][:, 1].tolist() == [0, 2]
-    assert terminal["occupancy"].shape == (1, 2, 2, 2)
-    for _ in range(3):
+    for tensors in (True, False):
+        vec = TactileVecEnv(Counter((2, 3), tensors=tensors))
+        vec.reset()
         act(vec)
-    assert terminal["qpos"][1] == 2 and (terminal["occupancy"] == 0).all()
-    assert observation["qpos"][:, 1].tolist() == [0, 2]  # the learner stores an observation after the next step
+        observation, _, dones, infos = act(vec)
+        assert dones.tolist() == [True, False]
+        assert "terminal_observation" not in infos[1]
+        terminal = infos[0]["terminal_observation"]
+        assert terminal["qpos"][1] == 2 and observation["qpos"][:, 1].tolist() == [0, 2]
+        assert terminal["occupancy"].shape == (1, 2, 2, 2)
+        for _ in range(3):
+            act(vec)
+        assert terminal["qpos"][1] == 2 and (terminal["occupancy"] == 0).all()
+        assert observation["qpos"][:, 1].tolist() == [0, 2]  # the learner stores an observation after the next step
 
 
-def test_finished_rows_only_are_reset() -> None:
-    vec = TactileVecEnv([Counter((2, 5))])
-    vec.reset()
+def test_episodes_go_on_where_others_end() -> None:
+    vec = TactileVecEnv(Counter((2, 5)), seed=7)
+    assert vec.reset()["qpos"][:, 0].tolist() == [7, 8]
     seen = [act(vec)[0]["qpos"][:, 1].tolist() for _ in range(5)]
     assert seen == [[1, 1], [0, 2], [1, 3], [0, 4], [1, 0]]
 
 
 @pytest.mark.parametrize("terminates", [False, True])
 def test_time_limit_is_marked_unless_terminated(terminates: bool) -> None:
-    vec = TactileVecEnv([Counter((1,), terminates)])
+    vec = TactileVecEnv(Counter((1,), terminates))
     vec.reset()
     _, _, dones, infos = act(vec)
     assert dones[0] and infos[0]["TimeLimit.truncated"] is (not terminates)
     assert infos[0]["elapsed"] == 1
 
 
+@pytest.mark.parametrize("terminates", [False, True])
+def test_the_learner_bootstraps_at_the_time_limit_and_only_there(terminates: bool) -> None:
+    """stable-baselines3 adds gamma V(terminal observation) to the last reward of an episode that the clock ended."""
+    vec = TactileVecEnv(Counter((4,), terminates))
+    model = PPO("MultiInputPolicy", vec, n_steps=4, batch_size=4, n_epochs=1, gamma=0.5, seed=0, device="cpu")
+    values = []
+    predict = model.policy.predict_values
+
+    def record(observation):
+        values.append((float(observation["qpos"][0, 1]), float(predict(observation)[0, 0])))
+        return predict(observation)
+
+    model.policy.predict_values = record  # type: ignore[method-assign]
+    model.learn(4)
+    rewards = model.rollout_buffer.rewards[:, 0]
+    assert rewards[:3].tolist() == [1, 2, 3]
+    bootstrapped = [value for step, value in values if step == 4]  # the counter's true last observation
+    assert len(bootstrapped) == (0 if terminates else 1)
+    assert rewards[3] == pytest.approx(4 + (0 if terminates else 0.5 * bootstrapped[0]))
+
+
 def test_kinds() -> None:
-    vec = TactileVecEnv([Counter((4,)), Counter((4,))])
+    vec = TactileVecEnv(Counter((4, 4)))
     observation = vec.reset()
     for _ in range(2):
         assert {key: value.dtype for key, value in observation.items()} == {
@@ -82,17 +94,16 @@ def test_kinds() -> None:
 
 
 def test_actions_reach_their_environment() -> None:
-    parts = [Counter((9, 9)), Counter((9,))]
-    vec = TactileVecEnv(parts)
+    counter = Counter((9, 9, 9))
+    vec = TactileVecEnv(counter)
     vec.reset()
     actions = np.arange(9, dtype=np.float32).reshape(3, 3)
     vec.step(actions)
-    assert parts[0].last_actions.tolist() == actions[:2].tolist()
-    assert parts[1].last_actions.tolist() == actions[2:].tolist()
+    assert counter.last_actions is not None and counter.last_actions.tolist() == actions.tolist()
 
 
 def test_episode_returns_under_a_monitor_are_numbers() -> None:
-    vec = VecMonitor(TactileVecEnv([Counter((2, 4))]))
+    vec = VecMonitor(TactileVecEnv(Counter((2, 4))))
     vec.reset()
     returns = []
     for _ in range(4):
@@ -102,39 +113,118 @@ def test_episode_returns_under_a_monitor_are_numbers() -> None:
     assert all(np.ndim(r) == 0 for r, _ in returns)
 
 
-def test_seeds_are_used_once() -> None:
-    vec = TactileVecEnv([Counter((9,)), Counter((9,))])
+def test_seeds_and_options_are_used_once() -> None:
+    counter = Counter((9, 9))
+    vec = TactileVecEnv(counter)
     vec.seed(40)
     assert vec.reset()["qpos"][:, 0].tolist() == [40, 41]
-    vec.environments[0].seeds[:] = 5
+    counter.seeds[0] = 5
     assert vec.reset()["qpos"][:, 0].tolist() == [5, 41]
 
 
 def test_methods_attributes_and_close() -> None:
-    parts = [Counter((9, 9)), Counter((9,))]
-    vec = TactileVecEnv(parts)
+    counter = Counter((9, 9, 9))
+    vec = TactileVecEnv(counter)
     assert vec.env_method("double", 4) == [8, 8, 8]
     assert vec.env_method("double", 4, indices=[2]) == [8]
-    assert vec.get_attr("num_envs") == [2, 2, 1]
+    assert vec.get_attr("num_envs") == [3, 3, 3]
     vec.set_attr("terminates", True, indices=2)
-    assert [part.terminates for part in parts] == [False, True]
+    assert counter.terminates
     assert vec.env_is_wrapped(gym.Wrapper) == [False] * 3
     vec.close()
-    assert all(part.closed for part in parts)
+    assert counter.was_closed
 
 
 def test_refusals() -> None:
-    with pytest.raises(InvalidInputError, match="none given"):
-        TactileVecEnv([])
-    other = Counter((3,))
-    other.single_action_space = spaces.Box(-1, 1, (4,), np.float32)
-    with pytest.raises(InvalidInputError, match="action spaces differ"):
-        TactileVecEnv([Counter((3,)), other])
+    late = Counter((3,))
+    late.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    with pytest.raises(InvalidInputError, match="expected SAME_STEP"):
+        TactileVecEnv(late)
     nested = Counter((3,))
-    nested.single_observation_space = spaces.Dict({"agent": spaces.Dict({"qpos": spaces.Box(-1, 1, (2,))})})
+    nested.set_spaces({"agent": spaces.Dict({"qpos": spaces.Box(-1, 1, (2,))})}, 3)
     with pytest.raises(InvalidInputError, match="flat dict"):
-        TactileVecEnv([nested])
-    vec = TactileVecEnv([Counter((3,))])
+        TactileVecEnv(nested)
+    vec = TactileVecEnv(Counter((3,)))
     vec.reset()
     with pytest.raises(InvalidInputError, match="step_async"):
         vec.step_wait()
+
+
+def test_the_real_environment_passes_what_check_env_asks_of_a_vec_env() -> None:
+    """stable-baselines3's ``check_env`` is for single environments; the same for a ``VecEnv``, over an episode's end."""
+    vec = VecMonitor(TactileVecEnv(tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=1), seed=3))
+    space = vec.observation_space
+    assert isinstance(space, spaces.Dict) and isinstance(vec.action_space, spaces.Box)
+    assert vec.action_space.shape == (NUM_JOINTS,) and vec.action_space.dtype == np.float32
+    assert (vec.action_space.low == -1).all() and (vec.action_space.high == 1).all()
+
+    def check(observation) -> None:
+        assert set(observation) == set(space.spaces)
+        for key, entry in space.spaces.items():
+            assert isinstance(observation[key], np.ndarray) and observation[key].dtype == entry.dtype, key
+            assert observation[key].shape == (2, *(entry.shape or ())) and np.isfinite(observation[key]).all()
+            assert all(entry.contains(row) for row in observation[key])
+
+    check(vec.reset())
+    generator = np.random.default_rng(0)
+    for step in range(1, HORIZON + 3):
+        observation, rewards, dones, infos = vec.step(generator.uniform(-1, 1, (2, NUM_JOINTS)).astype(np.float32))
+        check(observation)
+        assert rewards.shape == dones.shape == (2,) and rewards.dtype == np.float32 and dones.dtype == np.bool_
+        assert np.isfinite(rewards).all() and isinstance(infos, list) and len(infos) == 2
+        assert dones.all() == dones.any() == (step == HORIZON)
+        if step == HORIZON:
+            for info in infos:
+                assert info["TimeLimit.truncated"] is True
+                last = info["terminal_observation"]
+                check({key: np.stack([value, value]) for key, value in last.items()})
+                assert last["time"] == 1 and last["occupancy"].sum() > 0, "the true last one, not a reset one"
+                assert info["episode"]["l"] == HORIZON and isinstance(float(info["episode"]["r"]), float)
+                assert set(info) == {"TimeLimit.truncated", "terminal_observation", "episode"} | {
+                    "elapsed_steps",
+                    "new_touched",
+                    "new_visited",
+                }
+            assert (observation["time"] == 0).all() and (observation["occupancy"] == 0).all()
+    vec.close()
+
+
+def test_a_batched_maniskill_task_is_the_same_vector_environment() -> None:
+    """What CUDA uses, on the CPU with one environment: observations, rewards and ends as ``make_vec``'s, bit for bit."""
+    from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
+
+    arguments = {"objects": ("mug", "hammer")}
+    batched = BatchedVectorEnv(gym.make(ENVIRONMENT_ID, **arguments))
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 1, "cpu", processes=1, **arguments)
+    assert batched.metadata["autoreset_mode"] == envs.metadata["autoreset_mode"]
+    assert batched.observation_space == envs.observation_space and batched.action_space == envs.action_space
+    first, second = batched.reset(seed=5), envs.reset(seed=5)
+    generator = np.random.default_rng(1)
+    for step in range(HORIZON + 20):
+        compare(first, second, f"step {step}")
+        if step == HORIZON + 10:
+            compare(
+                batched.reset(options={"reset_mask": np.array([True]), "pose": 6}),
+                envs.reset(options={"reset_mask": np.array([True]), "pose": 6}),
+                "partial reset",
+            )
+        action = generator.uniform(-1, 1, (1, NUM_JOINTS)).astype(np.float32)
+        first, second = batched.step(action), envs.step(action)
+    with pytest.raises(InvalidInputError, match="reset_mask"):
+        batched.reset(options={"reset_mask": np.ones(3, dtype=bool)})
+    batched.close()
+    envs.close()
+
+
+def compare(a, b, where: str) -> None:
+    """Equal structure and bits, whatever the library."""
+    if isinstance(a, dict):
+        assert set(a) == set(b), where
+        for key in a:
+            compare(a[key], b[key], f"{where}, {key}")
+    elif isinstance(a, tuple):
+        for one, other in zip(a, b, strict=True):
+            compare(one, other, where)
+    else:
+        assert isinstance(a, torch.Tensor), where
+        np.testing.assert_array_equal(a.numpy(), b, err_msg=where)

@@ -38,8 +38,8 @@ def make_vec(
     """A Gymnasium vector environment (1.x semantics, autoreset ``SAME_STEP``) of many hands.
 
     On the CPU: scenes in worker processes, sensed as one batch per worker, observations as numpy arrays; bit for
-    bit the episodes of ``gymnasium.make`` with the same seeds. On CUDA: ManiSkill's GPU simulation and its vector
-    wrapper, observations as torch tensors on the device. *The CUDA path has not been run on a GPU yet.*
+    bit the episodes of ``gymnasium.make`` with the same seeds. On CUDA: ManiSkill's GPU simulation, observations as
+    torch tensors on the device. *The CUDA path has not been run on a GPU yet.*
 
     Args:
         environment_id: a registered id.
@@ -90,11 +90,10 @@ def _cuda_available() -> bool:
 
 
 def _make_cuda_vec(environment_id: str, num_envs: int, kwargs: dict[str, Any]) -> gymnasium.vector.VectorEnv:
-    """Not run on a GPU yet."""
-    from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+    from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
 
-    environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)
-    return ManiSkillVectorEnv(environment, auto_reset=True, ignore_terminations=True)
+    environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)  # GPU only
+    return BatchedVectorEnv(environment)
 
 
 def register_environments() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -58,7 +59,12 @@ def get_reconstructor(name: str) -> ReconstructorInfo:
 
 
 def make_reconstructor(
-    name: str, model: Path | None = None, split: str = "train", cache: Path | None = None, threads: int = 1
+    name: str,
+    model: Path | None = None,
+    split: str = "train",
+    cache: Path | None = None,
+    threads: int = 1,
+    objects: Sequence[str] = (),
 ) -> Reconstructor:
     """A reconstructor by its id.
 
@@ -68,6 +74,7 @@ def make_reconstructor(
         split: split whose prepared objects ``mean_shape`` and ``retrieval`` are built from.
         cache: asset cache, default the user's.
         threads: torch threads of the learned ones.
+        objects: build from these objects of the split; empty: all that are prepared.
 
     Raises:
         InvalidInputError: unknown name; a model missing, unreadable, of another architecture, or given in vain; the test
@@ -94,11 +101,11 @@ def make_reconstructor(
         from tslam_bench.reconstruction.priors import MeanShapeReconstructor, RetrievalReconstructor
         from tslam_bench.reconstruction.training_objects import load_training_objects
 
-        objects = load_training_objects(split, cache=cache)
-        solids = np.stack([item.solid for item in objects])
+        shapes = load_training_objects(split, cache, objects)
+        solids = np.stack([item.solid for item in shapes])
         if name == "mean_shape":
             return MeanShapeReconstructor(solids)
-        return RetrievalReconstructor(solids, np.stack([item.surface for item in objects]))
+        return RetrievalReconstructor(solids, np.stack([item.surface for item in shapes]))
     from tslam_bench.reconstruction.learned import load_reconstructor
 
     assert model is not None

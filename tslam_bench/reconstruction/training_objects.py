@@ -43,9 +43,9 @@ def training_names(
     return names[:count]
 
 
-def load_training_objects(split: str, cache: Path | None = None) -> list[PreparedObject]:
-    """All prepared objects of a split to learn from. Raises as :func:`training_names`."""
-    return [load_object(name, split, cache) for name in training_names(split, cache=cache)]
+def load_training_objects(split: str, cache: Path | None = None, objects: Sequence[str] = ()) -> list[PreparedObject]:
+    """``objects`` of a split to learn from, or all prepared ones. Raises as :func:`training_names`."""
+    return [load_object(name, split, cache) for name in training_names(split, objects=objects, cache=cache)]
 
 
 def load_training_shapes(

@@ -25,7 +25,7 @@ QUICK_GENERATED = {"train": 24, "val": 6}
 """Generated objects of the quick run."""
 FULL_GENERATED = {"train": 600, "val": 60}
 """Objects of a set that is generated only."""
-ADDED_ROUNDS = {"train": 5, "val": 6}
+ADDED_ROUNDS = {"train": 4, "val": 5}
 """Generated objects per category that the default set has beside the real ones."""
 
 
@@ -56,7 +56,7 @@ class Prepare:
     time_limit: float = 900.0
     """Seconds after which one object is given up."""
     write_manifest: Path | None = None
-    """Also write the split's manifest to this file."""
+    """Also write the split's manifest to this file (of train and val: one line per object)."""
 
 
 @dataclass(frozen=True)

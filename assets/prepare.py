@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import sys
@@ -16,7 +17,7 @@ from tslam_bench.assets.fetch import fetch
 from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import PROTOCOL_VERSION
 from tslam_bench.errors import BenchmarkError
-from tslam_bench.files import cache_directory, ensure_writable_directory, remove_directory, write_json
+from tslam_bench.files import atomic_file, cache_directory, ensure_writable_directory, remove_directory, write_json
 
 MANIFEST_VERSION = 1
 """Version of the manifest's layout."""
@@ -277,6 +278,10 @@ class _Rejections:
         entry = self._read(source.split).get(source.name, {})
         return entry["reason"] if entry.get("parameters_sha256") == parameters_sha256(source) else None
 
+    def reasons(self, split: str) -> dict[str, str]:
+        """Why each object of a split was rejected, by name, sorted."""
+        return {name: entry["reason"] for name, entry in sorted(self._read(split).items())}
+
     def add(self, source: Any, reason: str) -> None:
         """Remembers a rejection."""
         from tslam_bench.assets.pipeline import parameters_sha256
@@ -294,14 +299,38 @@ class _Rejections:
 
 
 def write_manifest(split: str, path: Path | None = None, cache: Path | None = None) -> Path:
-    """Writes the manifest of what is prepared of a split: ``<cache>/manifest-<split>.json`` unless ``path`` is given."""
+    """Writes the manifest of what is prepared of a split: ``<cache>/manifest-<split>.json`` unless ``path`` is given.
+
+    A manifest that is written elsewhere is a reference to keep under version control. That of train and val is short: a line
+    per object with one hash over its products, and the reason of every rejection.
+    """
     cache = cache or cache_directory()
-    path = path or cache / f"manifest-{split}.json"
-    manifest = {
+    records = store.list_objects(split, cache)
+    manifest: dict[str, Any] = {
         "manifest_version": MANIFEST_VERSION,
         "protocol_version": PROTOCOL_VERSION,
         "split": split,
-        "objects": store.list_objects(split, cache),
+        "objects": records,
     }
-    write_json(path, manifest)
+    if path is None or split == "test":
+        path = path or cache / f"manifest-{split}.json"
+        write_json(path, manifest)
+        return path
+    lines = [json.dumps(_short(record), sort_keys=True, allow_nan=False) for record in records]
+    names = {record["name"] for record in records}
+    rejected = {name: reason for name, reason in _Rejections(cache).reasons(split).items() if name not in names}
+    head = json.dumps(manifest | {"objects": [], "rejected": rejected}, indent=1, sort_keys=True, allow_nan=False)
+    with atomic_file(path) as temporary:
+        text = head.replace('"objects": []', '"objects": [\n' + ",\n".join(lines) + "\n ]", 1)
+        temporary.write_text(text + "\n", encoding="utf-8")
     return path
+
+
+def _short(record: dict[str, Any]) -> dict[str, Any]:
+    """A record without what only the files beside it need, and with one hash and the size of all of them."""
+    products = {name: stated["sha256"] for name, stated in record["products"].items()}
+    short = {key: value for key, value in record.items() if key not in ("products", "decomposition", "field")}
+    return short | {
+        "products_sha256": hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest(),
+        "bytes": sum(stated["bytes"] for stated in record["products"].values()),
+    }

@@ -73,6 +73,22 @@ def test_manifest_holds_the_records(cache):
     assert manifest["objects"] == store.list_objects("train", cache)
 
 
+def test_a_reference_manifest_is_short_and_says_the_same(cache, tmp_path):
+    path = prepare.write_manifest("train", tmp_path / "reference.json", cache)
+    manifest = json.loads(path.read_text())
+    full = store.list_objects("train", cache)
+    assert len(path.read_text().splitlines()) < 20
+    for short, record in zip(manifest["objects"], full, strict=True):
+        assert short["bytes"] == sum(
+            p.stat().st_size for p in store.object_directory(short["name"], "train", cache).glob("*.npy")
+        )
+        assert {key: record[key] for key in short if key in record} == {
+            key: short[key] for key in short if key in record
+        }
+    assert manifest["rejected"] == {}
+    assert len({short["products_sha256"] for short in manifest["objects"]}) == len(full)
+
+
 @dataclasses.dataclass(frozen=True)
 class SpikySource:
     """A source whose mesh is no solid, for the failure path."""

@@ -1,7 +1,8 @@
 """Reads mesh files of the kinds that 3D Warehouse and ShapeNet hold, as one mesh with z up.
 
 Scenes are baked: every node's transform is applied. COLLADA states its unit and its up axis, glTF is metres and y up, OBJ is
-taken as y up (as both sites publish it), the others as z up.
+taken as y up (as both sites publish it), the others as z up. Files are untrusted: what one announces is compared with what it
+holds before a reader allocates for it, nothing is unpacked to disk, and no file is opened but the mesh and the buffers beside it.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import io
 import zipfile
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
-from xml.etree import ElementTree
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
 
+from tslam_bench.assets import collada, gltf
+from tslam_bench.assets.announced import check_announced
 from tslam_bench.assets.meshes import TriangleMesh
 from tslam_bench.errors import AssetError
 
@@ -30,7 +33,11 @@ MAX_RATIO = 200
 MAX_MEMBERS = 10_000
 """Most members of an archive."""
 MAX_TRIANGLES = 2_000_000
-"""Most triangles of a mesh."""
+"""Most triangles of a mesh, all instances counted."""
+MAX_INSTANCES = 10_000
+"""Most nodes of a scene that show something."""
+MAX_COORDINATE = 1e12
+"""Largest coordinate."""
 
 _TO_Z_UP = {
     "x": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
@@ -67,6 +74,8 @@ def read_mesh_file(path: Path, up: UpAxis = "auto") -> TriangleMesh:
         data = path.read_bytes()
     except OSError as error:
         raise AssetError(f"cannot be read ({error.strerror or error})") from error
+    if not data:
+        raise AssetError("empty file")
     files: dict[str, bytes] = {}
     if suffix in ARCHIVE_SUFFIXES:
         name, files = _unpack(data)
@@ -75,39 +84,89 @@ def read_mesh_file(path: Path, up: UpAxis = "auto") -> TriangleMesh:
         inner = {PurePosixPath(key): content for key, content in files.items()}
         files = {str(key.relative_to(base)): content for key, content in inner.items() if base in key.parents}
     elif suffix == ".gltf":
-        files = _neighbours(path)
+        files = _beside(path, gltf.referenced_files(gltf.read_header(data, suffix)))
     return parse_mesh(data, suffix, up, files)
 
 
 def parse_mesh(data: bytes, suffix: str, up: UpAxis = "auto", files: dict[str, bytes] | None = None) -> TriangleMesh:
-    """The mesh in the bytes of a file whose format is ``suffix``; ``files`` are those that it may refer to."""
+    """The mesh in the bytes of a file whose format is ``suffix``; ``files`` are those that it may refer to.
+
+    Raises:
+        AssetError: one line that says what is wrong with the file.
+    """
+    resolver = _Resolver(files or {})
+    check_announced(data, suffix, MAX_TRIANGLES)
     unit = 1.0
     stated_up: str = _DEFAULT_UP.get(suffix, "z")
     if suffix == ".dae":
-        unit, stated_up = _collada_conventions(data)
-    options: dict[str, Any] = {"skip_materials": True} if suffix == ".obj" else {}
+        document = collada.inspect(data)
+        unit, stated_up = document.unit, document.up
+        _check_scene(document.instances, document.corners)
+    elif suffix in (".glb", ".gltf"):
+        header = gltf.read_header(data, suffix)
+        for name in gltf.referenced_files(header):
+            if resolver.find(name) is None:
+                raise AssetError(f"refers to {name[:80]!r}, which is not beside it")
+        gltf.check(header, MAX_BYTES, MAX_INSTANCES, 3 * MAX_TRIANGLES)
+    options: dict[str, Any] = {} if suffix in (".dae", ".stl", ".off") else {"skip_materials": True}
+    if suffix not in (".glb", ".gltf"):
+        resolver = _Resolver({})  # the others refer to materials and textures only, which are not needed
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=_Resolver(files or {}), **options)
-        mesh = scene.to_geometry() if scene.geometry else None
+        with np.errstate(all="ignore"):
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, **options)
+            vertices, faces = _bake(scene)
     except AssetError:
         raise
+    except MemoryError as error:
+        raise AssetError("needs more memory than it may use") from error
     except Exception as error:  # readers raise many kinds for a file that is not what it says
         raise AssetError(f"not a readable {suffix} file ({type(error).__name__}: {_first_line(error)})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise AssetError("holds no triangles")
-    if len(mesh.faces) > MAX_TRIANGLES:
-        raise AssetError(f"{len(mesh.faces)} triangles; the limit is {MAX_TRIANGLES}")
-    vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise AssetError("faces refer to vertices that are not there")
     used, inverse = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], inverse.reshape(-1, 3)
     if not np.isfinite(vertices).all():
         raise AssetError("vertices are not finite")
-    if np.abs(vertices).max() > 1e12:
-        raise AssetError("vertices are further out than any unit explains")
+    if np.abs(vertices).max() > MAX_COORDINATE:
+        raise AssetError(f"vertices are further out than any unit explains (beyond {MAX_COORDINATE:g})")
     rotation = _TO_Z_UP[stated_up if up == "auto" else up]
     return TriangleMesh(unit * vertices @ rotation.T, faces.astype(np.int64))
+
+
+def _check_scene(instances: int, corners: int) -> None:
+    if instances > MAX_INSTANCES:
+        raise AssetError(f"scene with {instances} geometries; the limit is {MAX_INSTANCES}")
+    if corners > 3 * MAX_TRIANGLES:
+        raise AssetError(f"scene with {corners} corners of polygons; the limit is {3 * MAX_TRIANGLES}")
+
+
+def _bake(scene: trimesh.Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of all meshes of a scene, every instance in its place; lines and points are left out."""
+    shown = []
+    count = 0
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+            continue
+        if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
+            raise AssetError("faces refer to vertices that are not there")
+        if not np.isfinite(transform).all():
+            raise AssetError("a node's transform is not finite")
+        count += len(geometry.faces)
+        if count > MAX_TRIANGLES or len(shown) >= MAX_INSTANCES:
+            raise AssetError(
+                f"more than {MAX_TRIANGLES} triangles or {MAX_INSTANCES} instances, which are the limits of a scene"
+            )
+        shown.append((geometry, transform))
+    if not shown:
+        raise AssetError("holds no triangles")
+    vertices, faces, offset = [], [], 0
+    for geometry, transform in shown:
+        placed = trimesh.Trimesh(geometry.vertices.copy(), geometry.faces.copy(), process=False)
+        placed.apply_transform(transform)  # also turns the faces of a mirrored instance
+        vertices.append(np.asarray(placed.vertices, dtype=np.float64))
+        faces.append(np.asarray(placed.faces, dtype=np.int64) + offset)
+        offset += len(placed.vertices)
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
 class _Resolver(trimesh.resolvers.Resolver):
@@ -116,12 +175,16 @@ class _Resolver(trimesh.resolvers.Resolver):
     def __init__(self, files: dict[str, bytes]) -> None:
         self._files = files
 
+    def find(self, name: str) -> bytes | None:
+        """The bytes of a file beside the mesh, None if there is no such file."""
+        return self._files.get(name, self._files.get(str(PurePosixPath(unquote(name.strip())))))
+
     def get(self, name: str) -> bytes:
-        """The bytes of a file beside the mesh."""
-        key = str(PurePosixPath(name.strip()))
-        if key not in self._files:
+        """See :meth:`find`; raises FileNotFoundError."""
+        found = self.find(name)
+        if found is None:
             raise FileNotFoundError(name)
-        return self._files[key]
+        return found
 
     def write(self, name: str, data: bytes) -> None:
         """Readers do not write."""
@@ -136,12 +199,20 @@ class _Resolver(trimesh.resolvers.Resolver):
         return self
 
 
-def _neighbours(path: Path) -> dict[str, bytes]:
-    """Binary files beside a .gltf."""
-    found = [
-        p for p in path.parent.rglob("*.bin") if p.is_file() and not p.is_symlink() and p.stat().st_size <= MAX_BYTES
-    ]
-    return {str(PurePosixPath(*p.relative_to(path.parent).parts)): p.read_bytes() for p in found[:20]}
+def _beside(path: Path, names: list[str]) -> dict[str, bytes]:
+    """The files ``names`` in the folder of ``path`` and below, as bytes; links that lead out of it are refused."""
+    folder = path.parent.resolve()
+    found: dict[str, bytes] = {}
+    for name in dict.fromkeys(names):
+        beside = (folder / unquote(name)).resolve()
+        if folder not in beside.parents:
+            raise AssetError(f"refers to {name[:80]!r}, which is outside its folder")
+        if not beside.is_file():
+            raise AssetError(f"refers to {name[:80]!r}, which is not beside it")
+        if beside.stat().st_size + sum(map(len, found.values())) > MAX_BYTES:
+            raise AssetError(f"its buffers have more than {MAX_BYTES / 1e6:.0f} MB, which is the limit")
+        found[name] = beside.read_bytes()
+    return found
 
 
 def _unpack(data: bytes) -> tuple[str, dict[str, bytes]]:
@@ -153,7 +224,7 @@ def _unpack(data: bytes) -> tuple[str, dict[str, bytes]]:
                 raise AssetError(f"archive with {len(members)} members; the limit is {MAX_MEMBERS}")
             for member in members:
                 parts = PurePosixPath(member.filename.replace("\\", "/")).parts
-                if ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
+                if not parts or ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
                     raise AssetError(f"archive member {member.filename!r} escapes the archive")
             total = sum(member.file_size for member in members)
             if total > MAX_BYTES or total > MAX_RATIO * max(len(data), 1):
@@ -177,26 +248,5 @@ def _unpack(data: bytes) -> tuple[str, dict[str, bytes]]:
         raise AssetError(f"not a readable archive ({type(error).__name__}: {_first_line(error)})") from error
 
 
-def _collada_conventions(data: bytes) -> tuple[float, str]:
-    """Metres per unit, and the up axis, of a COLLADA document."""
-    unit, up = 1.0, "y"
-    try:
-        for _, element in ElementTree.iterparse(io.BytesIO(data), events=("start",)):
-            tag = element.tag.rpartition("}")[2]
-            if tag == "unit":
-                unit = float(element.get("meter", 1.0))
-            elif tag == "library_geometries":
-                break
-        text = data[:20_000].decode("utf-8", "replace")
-        start = text.find("<up_axis>")
-        if start >= 0:
-            up = text[start + 9 : start + 10].lower()
-    except (ElementTree.ParseError, ValueError) as error:
-        raise AssetError(f"not a readable .dae file ({_first_line(error)})") from error
-    if up not in _TO_Z_UP or not (np.isfinite(unit) and unit > 0):
-        raise AssetError(f".dae states up axis {up!r} and unit {unit}")
-    return unit, up
-
-
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0][:160]
+    return " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())[:160]

@@ -196,6 +196,8 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
         return store.write(prepared, faces, cache)
     except AssetError as error:
         raise type(error)(f"{source.split}/{source.name}: {error}") from error
+    except MemoryError as error:
+        raise AssetError(f"{source.split}/{source.name}: needs more memory than a worker may use") from error
 
 
 def check_size(mesh: TriangleMesh) -> None:

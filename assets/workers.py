@@ -15,10 +15,25 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "IGL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+MEMORY_LIMIT = 8 * 2**30
+"""Address space (bytes) of a worker: a job that asks for more fails alone, instead of bringing the machine down."""
 
 
-def _serve(connection: Connection, function: Callable[..., Any]) -> None:
+def _limit_memory(limit: int) -> None:
+    """Limits this process's address space, where the operating system can."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if hard == resource.RLIM_INFINITY or limit < hard:
+        with contextlib.suppress(ValueError, OSError):  # macOS refuses
+            resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+
+
+def _serve(connection: Connection, function: Callable[..., Any], memory_limit: int = MEMORY_LIMIT) -> None:
     """Worker loop: one job after the other, each on one thread so that workers do not fight for the cores."""
+    _limit_memory(memory_limit)
     with contextlib.suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
         while True:
             connection.send(function(*connection.recv()))
@@ -42,11 +57,13 @@ class WorkerPool(Generic[Item, Result]):
         function: importable function; its result must be picklable and it should not raise.
         size: processes.
         time_limit: seconds after which a job is given up and its process killed.
+        memory_limit: bytes of address space of each process.
     """
 
     function: Callable[..., Result]
     size: int
     time_limit: float
+    memory_limit: int = MEMORY_LIMIT
     _workers: list[_Worker[Item]] = field(default_factory=list)
 
     @property
@@ -100,7 +117,7 @@ class WorkerPool(Generic[Item, Result]):
     def _start(self) -> _Worker[Item]:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self.function), daemon=True)
+        process = context.Process(target=_serve, args=(theirs, self.function, self.memory_limit), daemon=True)
         before = {variable: os.environ.get(variable) for variable in _THREAD_VARIABLES}
         os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))  # read when the libraries load, in the new process
         try:

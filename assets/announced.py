@@ -104,3 +104,5 @@ def _check_off(data: bytes, max_triangles: int) -> None:
 
 def _check_obj(data: bytes, max_triangles: int) -> None:
     _limit(data.count(b"\nf "), max_triangles)
+    if re.search(rb"^f[^\n]*?[ \t]0+(?=[\s/])", data, re.MULTILINE):
+        raise AssetError(".obj faces refer to vertex 0; its vertices count from 1")

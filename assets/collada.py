@@ -43,7 +43,7 @@ def inspect(data: bytes) -> Document:
 
     Raises:
         AssetError: not XML, a document type is declared (its entities can be bombs or reach other files), elements or nodes
-            are nested too deeply or in a circle, or unit and axis make no sense.
+            are nested too deeply or in a circle, an index is negative, or unit and axis make no sense.
     """
     reader = _Reader()
     parser = expat.ParserCreate()
@@ -143,6 +143,8 @@ class _Reader:
         if self._collect is not None:
             self._collect += content
         elif self._path and self._path[-1] == "p":
+            if "-" in content:
+                raise AssetError(".dae faces refer to vertices by negative numbers")
             continued = self._inside_index and not content[0].isspace()
             self._indices += len(content.split()) - continued
             self._inside_index = not content[-1].isspace()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tslam_bench.assets import meshfiles, store
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import sha256_file
 
 SKIPPED_SUFFIXES = (
@@ -65,12 +65,16 @@ class ImportedSource:
         return f"imported:{digest}:{self.up}:{self.unit}:{self.category}:{self.license}:{self.origin}"
 
     def load(self, cache: Path) -> Any:
-        """See :class:`tslam_bench.assets.pipeline.Source`."""
+        """See :class:`tslam_bench.assets.pipeline.Source`. Errors name the file."""
         from tslam_bench.assets.meshes import TriangleMesh
         from tslam_bench.assets.pipeline import SourceMesh
         from tslam_bench.assets.scaling import scale_to_hand
 
-        mesh = meshfiles.read_mesh_file(Path(self.path), self.up)
+        try:
+            self._check_name_is_free(cache)
+            mesh = meshfiles.read_mesh_file(Path(self.path), self.up)
+        except AssetError as error:
+            raise AssetError(f"{ascii(Path(self.path).name)[1:-1]}: {error}") from error
         factor = self.unit
         if factor is None:
             mesh, factor = scale_to_hand(mesh, self.name)
@@ -86,6 +90,19 @@ class ImportedSource:
             sha256=sha256_file(Path(self.path)),
             details={"scale": factor},
         )
+
+    def _check_name_is_free(self, cache: Path) -> None:
+        """Raises AssetError if an object of another source has this name in a split that is the benchmark's own."""
+        if self.split not in store.SPLITS:
+            return
+        try:
+            holder = store.read_record(self.name, self.split, cache)["source"]
+        except (AssetError, KeyError):
+            return  # not prepared, or unusable
+        if not str(holder).startswith(f"{self.origin}: "):
+            raise AssetError(
+                f"name {self.name!r} is taken by an object of another source ({holder}); rename the file or its folder"
+            )
 
 
 def check_name(text: str, what: str) -> str:

@@ -113,14 +113,17 @@ def parse_mesh(data: bytes, suffix: str, up: UpAxis = "auto", files: dict[str, b
         resolver = _Resolver({})  # the others refer to materials and textures only, which are not needed
     try:
         with np.errstate(all="ignore"):
-            scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, **options)
-            vertices, faces = _bake(scene)
+            scene = trimesh.load_scene(
+                io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options
+            )
+            vertices, faces = _bake(scene, merge=suffix not in (".glb", ".gltf"))
     except AssetError:
         raise
     except MemoryError as error:
         raise AssetError("needs more memory than it may use") from error
     except Exception as error:  # readers raise many kinds for a file that is not what it says
-        raise AssetError(f"not a readable {suffix} file ({type(error).__name__}: {_first_line(error)})") from error
+        reason = _first_line(error) or "its parts do not fit together"
+        raise AssetError(f"not a readable {suffix} file ({type(error).__name__}: {reason})") from error
     used, inverse = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], inverse.reshape(-1, 3)
     if not np.isfinite(vertices).all():
@@ -138,8 +141,16 @@ def _check_scene(instances: int, corners: int) -> None:
         raise AssetError(f"scene with {corners} corners of polygons; the limit is {3 * MAX_TRIANGLES}")
 
 
-def _bake(scene: trimesh.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of all meshes of a scene, every instance in its place; lines and points are left out."""
+def _bake(scene: trimesh.Scene, merge: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of all meshes of a scene, every instance in its place; lines and points are left out.
+
+    Args:
+        scene: the scene as it was read.
+        merge: whether to merge equal vertices of a mesh.
+
+    Raises:
+        AssetError: nothing is left, something is above its limit, or a face, vertex or transform makes no sense.
+    """
     shown = []
     count = 0
     for node in scene.graph.nodes_geometry:
@@ -149,8 +160,10 @@ def _bake(scene: trimesh.Scene) -> tuple[np.ndarray, np.ndarray]:
             continue
         if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
             raise AssetError("faces refer to vertices that are not there")
-        if not np.isfinite(transform).all():
-            raise AssetError("a node's transform is not finite")
+        if not np.isfinite(geometry.vertices).all():
+            raise AssetError("vertices are not finite")
+        if not np.abs(transform).max() <= MAX_COORDINATE or not np.allclose(transform[3], (0, 0, 0, 1)):
+            raise AssetError("a node's transform is not finite, or none that moves, turns and scales")
         count += len(geometry.faces)
         if count > MAX_TRIANGLES or len(shown) >= MAX_INSTANCES:
             raise AssetError(
@@ -160,6 +173,9 @@ def _bake(scene: trimesh.Scene) -> tuple[np.ndarray, np.ndarray]:
     if not shown:
         raise AssetError("holds no triangles")
     vertices, faces, offset = [], [], 0
+    if merge:
+        for geometry in {id(geometry): geometry for geometry, _ in shown}.values():
+            geometry.process()
     for geometry, transform in shown:
         placed = trimesh.Trimesh(geometry.vertices.copy(), geometry.faces.copy(), process=False)
         placed.apply_transform(transform)  # also turns the faces of a mirrored instance
@@ -226,6 +242,8 @@ def _unpack(data: bytes) -> tuple[str, dict[str, bytes]]:
                 parts = PurePosixPath(member.filename.replace("\\", "/")).parts
                 if not parts or ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
                     raise AssetError(f"archive member {member.filename!r} escapes the archive")
+                if member.flag_bits & 1:
+                    raise AssetError("archive is encrypted")
             total = sum(member.file_size for member in members)
             if total > MAX_BYTES or total > MAX_RATIO * max(len(data), 1):
                 raise AssetError(

@@ -123,10 +123,7 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
         ground_truth = from_manifold(filled.solid)
         closest = None
         if item.split != "test":  # the test split is given; elsewhere another object takes the place of a bad one
-            if repaired.kept_share < MIN_KEPT_SHARE:
-                raise GateError(f"gate: the largest part holds only {repaired.kept_share:.0%} of the volume")
-            if ground_truth.extents.min() < MIN_THICKNESS * ground_truth.extents.max():
-                raise GateError("gate: flat as a sheet")
+            check_gates(ground_truth, repaired.kept_share)
         if item.split in LEAKAGE_SPLITS:
             closest = leakage.closest(ground_truth, leakage.references(fetch(CONTACTDB_WHEEL, cache), cache))
             if closest.is_copy:
@@ -209,6 +206,17 @@ def check_size(mesh: TriangleMesh) -> None:
         raise AssetError(
             f"longest edge {longest:.4g} m is outside {MIN_EXTENT} to {WORKSPACE_EDGE} m; check the unit of the mesh"
         )
+
+
+def check_gates(ground_truth: TriangleMesh, kept_share: float) -> None:
+    """Raises GateError for a repaired mesh that is in parts, flat, or larger than the workspace."""
+    if kept_share < MIN_KEPT_SHARE:
+        raise GateError(f"gate: the largest part holds only {kept_share:.0%} of the volume")
+    extents = ground_truth.extents
+    if extents.min() < MIN_THICKNESS * extents.max():
+        raise GateError("gate: flat as a sheet")
+    if not MIN_EXTENT <= extents.max() <= WORKSPACE_EDGE:
+        raise GateError(f"gate: {extents.max():.4g} m long after repair, outside {MIN_EXTENT} to {WORKSPACE_EDGE} m")
 
 
 def _repair_error(original: TriangleMesh, repaired: TriangleMesh) -> float:

@@ -76,7 +76,7 @@ def repair(mesh: TriangleMesh) -> Repaired:
         raise AssetError(f"no solid can be made of the mesh (repair by {method}: {solid.status().name})")
     solid, kept_share = largest_part(solid)
     simplified = _without_crumbs(simplify(solid, MAX_TRIANGLES))
-    if simplified.is_empty():
+    if not is_valid(simplified):
         raise AssetError("flat: nothing is left of the mesh when it is simplified")
     return Repaired(simplified, method, kept_share)
 

@@ -73,7 +73,9 @@ def repair(mesh: TriangleMesh) -> Repaired:
         rebuilt = remesh_by_winding(mesh) if method == "winding" else remesh_by_ball(mesh)
         solid = to_manifold(rebuilt)
     if not is_valid(solid) or solid.volume() <= 0:
-        raise AssetError(f"no solid can be made of the mesh (repair by {method}: {solid.status().name})")
+        status = solid.status()
+        reason = "it encloses no volume" if status == manifold3d.Error.NoError else status.name
+        raise AssetError(f"no solid can be made of the mesh (repair by {method}: {reason})")
     solid, kept_share = largest_part(solid)
     simplified = _without_crumbs(simplify(solid, MAX_TRIANGLES))
     if not is_valid(simplified):

@@ -39,12 +39,15 @@ CONTACTDB = ("mug", "bowl", "stapler", "eyeglasses", "scissors", "phone")
 """Real meshes that are mutated: four clean ones and two that are none (bowl, stapler, phone have slits)."""
 GENERATED = ("carton", "mug", "bowl", "key")
 SPLIT = "fuzz"
-COARSE_CELLS = 64
-"""Samples along the longest edge when the cheap pass rebuilds a surface."""
+COARSE_CELLS = {"REMESH_CELLS": 64, "BALL_CELLS": 128}
+"""Samples along the longest edge when the cheap pass rebuilds a surface (few enough to be fast, enough to tell a sheet)."""
 
 REASONS = (
     ("not what its name says", r"not the \.\w+ file|unknown kind of file|SketchUp|not a COLLADA"),
-    ("not readable", r"not a readable|not a binary glTF|glTF \w+ (is|are)|glTF header|inconsistent|version \d+"),
+    (
+        "not readable",
+        r"not a readable|cannot be read|not a binary glTF|glTF \w+ (is|are)|glTF header|inconsistent|version \d+",
+    ),
     ("empty, or holds no triangles", r"empty file|no triangles|holds 0 meshes"),
     ("announces more than it holds", r"announces|reaches outside|has fewer lines|larger than it says"),
     ("refers to what is not there", r"refers? to|not there|vertex 0|negative numbers|outside the file's folder"),
@@ -106,7 +109,8 @@ def write_mutants(mutants: list[Mutant], folder: Path) -> list[importer.Imported
 
 def cheap_import(source: importer.ImportedSource, cache: Path) -> tuple[str, str]:
     """An import up to and including repair and its gates: (accepted, "") or (rejected, reason) or (unexpected, error)."""
-    repair.REMESH_CELLS = repair.BALL_CELLS = COARSE_CELLS
+    fine = {name: getattr(repair, name) for name in COARSE_CELLS}
+    vars(repair).update(COARSE_CELLS)
     try:
         item = source.load(cache)
         check_size(item.mesh)
@@ -117,6 +121,8 @@ def cheap_import(source: importer.ImportedSource, cache: Path) -> tuple[str, str
         return "rejected", str(error)
     except Exception as error:
         return "unexpected", f"{type(error).__name__}: {error}"
+    finally:
+        vars(repair).update(fine)
     broken = "" if is_valid(repaired.solid) else "not a valid solid"
     broken = broken or broken_invariant(solid)
     return ("invalid", broken) if broken else ("accepted", repaired.method)

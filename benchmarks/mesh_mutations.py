@@ -423,7 +423,11 @@ HOSTILE: dict[str, bytes | dict[str, bytes]] = {
     "parents.glb": _with((("nodes",), [{"children": [1, 2]}, {"children": [3]}, {"children": [3]}, {"mesh": 0}])),
     "chain.glb": _with((("nodes",), [*({"children": [k + 1]} for k in range(5000)), {"mesh": 0}])),
     "instances.glb": _with((("nodes",), [{"mesh": 0}] * 50_000), (("scenes", 0, "nodes"), list(range(50_000)))),
-    "views.glb": _with((("bufferViews",), [{"buffer": 0, "byteOffset": 0, "byteLength": 96}] * 3_000_000)),
+    "views.glb": glb(
+        gltf_header()
+        | {"buffers": [{"byteLength": 10**5}], "bufferViews": [{"buffer": 0, "byteLength": 10**5}] * 3000},
+        bytes(10**5),
+    ),
     "index.glb": glb(gltf_header(), _TETRAHEDRON.tobytes() + (_TETRAHEDRON_FACES + 2).tobytes()),
     "matrix.glb": _with((("nodes", 0, "matrix"), [1e308] * 16)),
     "child.glb": _with((("nodes", 0, "children"), [7])),

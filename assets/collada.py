@@ -170,7 +170,9 @@ class _Reader:
             order = list(TopologicalSorter(below).static_order())
         except CycleError as error:
             raise AssetError(".dae nodes instance each other in a circle") from error
-        instances, corners, height = {}, {}, {}
+        instances: dict[int, int] = {}
+        corners: dict[int, int] = {}
+        height: dict[int, int] = {}
         for index in order:
             shown = self._nodes[index].geometries
             instances[index] = len(shown) + sum(instances[k] for k in below[index])

@@ -151,7 +151,7 @@ def _bake(scene: trimesh.Scene, merge: bool) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         AssetError: nothing is left, something is above its limit, or a face, vertex or transform makes no sense.
     """
-    shown = []
+    shown: list[tuple[trimesh.Trimesh, np.ndarray]] = []
     count = 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]

@@ -55,7 +55,7 @@ REASONS = (
     ("archive refused", r"archive"),
     ("not finite, or far out", r"not finite|further out|none that moves"),
     ("unit", r"outside 0\.005 to|check the unit|\bunit\b"),
-    ("no solid", r"no solid|no area|no volume|no extent"),
+    ("no solid", r"no solid|flat: nothing|no area|no volume|no extent"),
     ("gate", r"gate:"),
 )
 """Class of a refusal and the pattern of its reason; the first that fits counts."""

@@ -338,9 +338,8 @@ def _list(command: List) -> None:
             f"{gates['hull_iou']:.3f}" + (" " if gates["hull_iou_passes"] else "*"),
             f"{1e3 * gates['field_error_m']:.2f}",
         )
-    console = Console()
-    console = Console(width=max(console.width, 110))  # a pipe has no width; names must not be cut
-    console.print(table)
+    needed = Console(width=1_000).measure(table).maximum  # a pipe has no width; names must not be cut
+    Console(width=max(Console().width, needed)).print(table)
     if not all(record["gates"]["hull_iou_passes"] for record in records):
         print("* below the gate of 0.85 (docs/objects.md gives the reasons)")
 

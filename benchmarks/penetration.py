@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from report import machine, markdown_table, print_table, replace_section, write_json
 from rollouts import TEN_OBJECTS, Hands, PressingHands, run_episode
 from separation import SeparationRuler
+from touch_audit import Audit
 
 from tslam_bench.constants import NUM_POSES
 from tslam_bench.tasks.batch import BatchSettings
@@ -47,23 +48,29 @@ class Config:
     """Page whose section ``penetration`` is replaced by the table."""
 
 
-def penetration_depths(objects: Sequence[str], poses: int) -> dict[str, NDArray[np.float64]]:
-    """Depth (m) of every contact step of pressing hands, per object; one episode per object and pose."""
+def pressing_audits(objects: Sequence[str], poses: int) -> dict[str, Audit]:
+    """The skin against the ruler's contacts, and the depth of every contact step, of hands that press on each object.
+
+    One episode per object and pose.
+    """
     names = list(objects)
     hands = Hands(len(names), BatchSettings(objects=tuple(names)))
-    found: dict[str, list[float]] = {name: [] for name in names}
+    counts = {name: np.zeros(3, dtype=np.int64) for name in names}  # both, skin only, ruler only
+    depths: dict[str, list[float]] = {name: [] for name in names}
     for episode in range(poses):
         turned = [(episode + env) % NUM_POSES for env in range(len(names))]
         rulers = [SeparationRuler(name, pose) for name, pose in zip(names, turned, strict=True)]
 
         def look(_: int, rulers: list[SeparationRuler] = rulers) -> None:
-            for name, ruler, qpos in zip(names, rulers, hands.arrays["qpos"], strict=True):
-                distance = ruler.nearest(qpos)
-                if distance < CONTACT_SEPARATION:
-                    found[name].append(max(0.0, -distance))
+            for env, (name, ruler) in enumerate(zip(names, rulers, strict=True)):
+                links, nearest = ruler.measure(hands.arrays["qpos"][env])
+                felt, truth = hands.arrays["touch"][env].astype(bool), links < CONTACT_SEPARATION
+                counts[name] += ((felt & truth).sum(), (felt & ~truth).sum(), (truth & ~felt).sum())
+                if nearest < CONTACT_SEPARATION:
+                    depths[name].append(max(0.0, -nearest))
 
         run_episode(hands, 1000 * episode, PressingHands(len(names), episode), look, names, turned)
-    return {name: np.array(depths) for name, depths in found.items()}
+    return {name: Audit(*(int(count) for count in counts[name]), np.array(depths[name])) for name in names}
 
 
 def statistics_of(depths: NDArray[np.float64]) -> dict[str, float]:
@@ -78,8 +85,8 @@ def statistics_of(depths: NDArray[np.float64]) -> dict[str, float]:
 def measure(config: Config, settings: MujocoSettings | None) -> dict[str, float]:
     """Statistics of the engine (None) or of a peer, all objects together."""
     with contextlib.nullcontext() if settings is None else mujoco_batches(settings):
-        depths = penetration_depths(config.objects, config.poses)
-    return statistics_of(np.concatenate(list(depths.values())))
+        audits = pressing_audits(config.objects, config.poses)
+    return statistics_of(np.concatenate([audit.depths for audit in audits.values()]))
 
 
 def main(config: Config) -> None:

@@ -38,19 +38,16 @@ class SeparationRuler:
         for row, link in enumerate(SKIN_LINKS):
             self._row[self._model.body(link).id] = row
 
-    def links(self, qpos: NDArray) -> NDArray[np.float64]:
-        """(L,) smallest distance (m) of each skin link from the object, infinite beyond ``REACH``, at (28,) joint positions."""
-        distance, geoms = self._contacts(qpos)
-        nearest = np.full(len(SKIN_LINKS) + 1, np.inf)  # the last one takes the forearm
-        hand_geom = np.where(self._is_object[geoms[:, 0]], geoms[:, 1], geoms[:, 0])
-        np.minimum.at(nearest, self._row[self._model.geom_bodyid[hand_geom]], distance)
-        return nearest[:-1]
+    def measure(self, qpos: NDArray) -> tuple[NDArray[np.float64], float]:
+        """Smallest distances (m) from the object at (28,) joint positions, infinite beyond ``REACH``.
 
-    def nearest(self, qpos: NDArray) -> float:
-        """Smallest distance (m) of any part of the hand, forearm included; infinite beyond ``REACH``."""
-        return float(self._contacts(qpos)[0].min(initial=np.inf))
-
-    def _contacts(self, qpos: NDArray) -> tuple[NDArray, NDArray]:
+        Returns:
+            (L,) of each skin link, and that of the whole hand with its forearm.
+        """
         self._data.qpos[self._joints] = qpos
         mujoco.mj_fwdPosition(self._model, self._data)
-        return self._data.contact.dist, self._data.contact.geom.reshape(-1, 2)
+        distance, geoms = self._data.contact.dist, self._data.contact.geom.reshape(-1, 2)
+        hand_geom = np.where(self._is_object[geoms[:, 0]], geoms[:, 1], geoms[:, 0])
+        nearest = np.full(len(SKIN_LINKS) + 1, np.inf)  # the last one is the forearm's
+        np.minimum.at(nearest, self._row[self._model.geom_bodyid[hand_geom]], distance)
+        return nearest[:-1], float(nearest.min())

@@ -38,22 +38,22 @@ class Config:
 
 @dataclass(frozen=True)
 class Audit:
-    """Counts of (link, step) pairs: felt by both, by one only; and penetration depths (m) per contact step."""
+    """The skin against an oracle: (link, step) pairs felt by both or by one only, and depths (m) per contact step."""
 
     both: int
     probes_only: int
-    physx_only: int
+    oracle_only: int
     depths: np.ndarray
 
     @property
     def precision(self) -> float:
-        """Share of the probes' touches that PhysX confirms."""
+        """Share of the probes' touches that the oracle confirms."""
         return self.both / max(1, self.both + self.probes_only)
 
     @property
     def recall(self) -> float:
-        """Share of PhysX's touches that the probes feel."""
-        return self.both / max(1, self.both + self.physx_only)
+        """Share of the oracle's touches that the probes feel."""
+        return self.both / max(1, self.both + self.oracle_only)
 
 
 def pressing_action(generator: np.random.Generator, held: np.ndarray, step: int, qpos: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def audit(name: str, episodes: int) -> Audit:
     """Rolls out ``episodes`` pressing episodes on one object."""
     environment = gym.make(ENVIRONMENT_ID, object=name)
     base = environment.unwrapped
-    both = probes_only = physx_only = 0
+    both = probes_only = oracle_only = 0
     depths = []
     for episode in range(episodes):
         generator = np.random.Generator(np.random.PCG64(episode))
@@ -94,12 +94,12 @@ def audit(name: str, episodes: int) -> Audit:
             felt, truth = observation["touch"][0].numpy().astype(bool), physx_touch(environment)
             both += int((felt & truth).sum())
             probes_only += int((felt & ~truth).sum())
-            physx_only += int((truth & ~felt).sum())
+            oracle_only += int((truth & ~felt).sum())
             separations = [point.separation for contact in base.scene.px.get_contacts() for point in contact.points]
             if separations and min(separations) < PHYSX_TOUCH_SEPARATION:
                 depths.append(max(0.0, -min(separations)))
     environment.close()
-    return Audit(both, probes_only, physx_only, np.array(depths))
+    return Audit(both, probes_only, oracle_only, np.array(depths))
 
 
 def main(config: Config) -> None:
@@ -111,7 +111,7 @@ def main(config: Config) -> None:
         p95 = np.percentile(result.depths, 95) if len(result.depths) else 0.0
         worst = result.depths.max(initial=0.0)
         numbers = (f"{result.precision:.3f}", f"{result.recall:.3f}", f"{1e3 * p95:.2f}", f"{1e3 * worst:.2f}")
-        table.add_row(name, str(result.both + result.physx_only), *numbers)
+        table.add_row(name, str(result.both + result.oracle_only), *numbers)
     Console().print(table)
 
 

@@ -59,7 +59,7 @@ def test_peer_feels_the_object_and_stays_out_of_it():
 
     def look(_):
         for env in range(2):
-            links = ruler.links(hands.arrays["qpos"][env])
+            links, _ = ruler.measure(hands.arrays["qpos"][env])
             felt.append((hands.arrays["touch"][env].astype(bool), links < 0.5e-3))
             depths.append(-min(0.0, links.min()))
 
@@ -78,7 +78,7 @@ def test_ruler_measures_a_known_distance():
     nearest = []
     for height in heights:
         qpos[1] = height
-        nearest.append(ruler.nearest(qpos))
+        nearest.append(ruler.measure(qpos)[1])
     distance = np.array(nearest)
     assert np.isinf(distance[0]), "nothing is near at the top"
     first = int(np.flatnonzero(np.isfinite(distance))[0])

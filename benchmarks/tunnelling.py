@@ -62,13 +62,14 @@ class HullUnion:
         self._normal, self._offset = padded[..., :3], padded[..., 3]
         field = prepared.field
         self._values, self._origin, self._spacing = field.values, np.asarray(field.origin), field.spacing
+        self._last_cell = np.array(field.values.shape) - 1
 
-    def near(self, points: NDArray, reach: NDArray) -> NDArray[np.bool_]:
-        """(n,) bool: whether the hulls may be within ``reach`` (n,) of points (n, 3)."""
-        size = np.array(self._values.shape)
-        index = np.clip(np.rint((points - self._origin) / self._spacing).astype(int), 0, size - 1)
+    def at_least(self, points: NDArray) -> NDArray[np.float64]:
+        """(n,) a lower bound of the distance (m) of points (n, 3) from the hulls."""
+        cell = ((points - self._origin) * (1.0 / self._spacing) + 0.5).astype(int)
+        x, y, z = np.minimum(np.maximum(cell, 0), self._last_cell).T
         # The nearest sample is at most half a cell's diagonal away; beyond the field's box it is nearer to the object.
-        return self._values[tuple(index.T)] < reach + 0.87 * self._spacing
+        return self._values[x, y, z] - 0.87 * self._spacing
 
     def crossed(self, start: NDArray, end: NDArray) -> NDArray[np.bool_]:
         """(n,) bool: whether segments (n, 3) to (n, 3) have a point inside a hull."""
@@ -94,6 +95,8 @@ class AxisWatch:
         on_axis = probes.radius > 0  # boxes have their probes on their faces
         self._link, self._local = probes.link[on_axis], probes.position[on_axis].astype(np.float64)
         self._joined = np.flatnonzero(self._link[1:] == self._link[:-1])  # each with the next one
+        between = self._local[self._joined + 1] - self._local[self._joined]
+        self._gap = np.linalg.norm(between, axis=1) + 1e-5  # rigid links: the distance never changes, but for rounding
         self._union, self._turn = union, grids.pose_rotation(pose).astype(np.float64)
         self._last: NDArray | None = None
         self._quiet = QUIET_STEPS
@@ -115,12 +118,13 @@ class AxisWatch:
         world = np.einsum("pij,pj->pi", poses[:, :, :3], self._local) + poses[:, :, 3]
         points = world @ self._turn  # into the object's frame: the turn's inverse
         inside = jumped = False
-        first, second = points[self._joined], points[self._joined + 1]
-        near = self._union.near(first, np.linalg.norm(second - first, axis=1))
-        if near.any():
-            inside = bool(self._union.crossed(first[near], second[near]).any())
+        clear = self._union.at_least(points)
+        joined = self._joined[clear[self._joined] < self._gap]
+        if len(joined):
+            inside = bool(self._union.crossed(points[joined], points[joined + 1]).any())
         if self._last is not None:
-            near = self._union.near(points, np.linalg.norm(points - self._last, axis=1))
+            moved = points - self._last
+            near = clear * np.abs(clear) < np.einsum("pk,pk->p", moved, moved)
             if near.any():
                 start, end = self._last[near], points[near]
                 outside = ~self._union.contains(start) & ~self._union.contains(end)

@@ -8,7 +8,7 @@ the same convex hulls. Needs ``mujoco``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -72,6 +72,9 @@ class MujocoPool:
     _models: dict[str, Any] = field(default_factory=dict)
     _free: dict[str, list[Any]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.hand = build_model(self.urdf, self.settings, None)
+
     def borrow(self, prepared: PreparedObject) -> tuple[Any, Any]:
         """The model of an object and a state of it that no scene uses."""
         model = self._models.get(prepared.name)
@@ -93,6 +96,12 @@ class MujocoScene:
         self._name = ""
         self.model: Any = None
         self.data: Any = None
+        self.joint_order = np.array([pool.hand.joint(name).qposadr[0] for name in JOINT_NAMES])
+        self.num_bodies = pool.hand.nbody + 1  # and the object, which comes last
+
+    def skin_rows(self) -> NDArray[np.int64]:
+        """(L,) rows of the skin links in the packed poses; the same in every scene."""
+        return np.array([self._pool.hand.body(name).id for name in SKIN_LINKS], dtype=np.int64)
 
     def begin(self, start: Start) -> None:
         """Starts an episode from a clean state."""
@@ -101,15 +110,13 @@ class MujocoScene:
         self._name = start.prepared.name
         self.model, self.data = self._pool.borrow(start.prepared)
         mujoco.mj_resetData(self.model, self.data)
-        self._joints = np.array([self.model.joint(name).qposadr[0] for name in JOINT_NAMES])
-        self._bodies = np.array([self.model.body(name).id for name in SKIN_LINKS])
         self.data.mocap_quat[0] = physics.pose_quaternion(start.pose)
-        self.data.qpos[self._joints] = start.qpos
-        self.set_targets(start.qpos)
+        self.data.qpos[self.joint_order] = start.qpos
+        self.set_targets(start.qpos.tolist())
         mujoco.mj_kinematics(self.model, self.data)
 
-    def set_targets(self, targets: NDArray[np.float32]) -> None:
-        """Sets the (28,) drive targets, in the order of ``JOINT_NAMES``."""
+    def set_targets(self, targets: Sequence[float]) -> None:
+        """Sets the 28 drive targets, in the order of ``JOINT_NAMES``."""
         self.data.ctrl[:] = targets  # actuators are in that order
 
     def step(self) -> None:
@@ -117,13 +124,13 @@ class MujocoScene:
         mujoco.mj_step(self.model, self.data, nstep=self._pool.settings.substeps)
         mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves the body poses of the step before
 
-    def read(self, qpos: NDArray, qvel: NDArray, link_matrices: NDArray) -> None:
-        """Writes (28,) positions, (28,) velocities and (L, 3, 4) poses of the skin links into the given arrays."""
+    def read(self, qpos: NDArray, qvel: NDArray, poses: NDArray) -> None:
+        """Writes (28,) positions and velocities in MuJoCo's order (``joint_order``), and (M, 7) packed poses."""
         data = self.data
-        qpos[:] = data.qpos[self._joints]
-        qvel[:] = data.qvel[self._joints]
-        link_matrices[:, :, :3] = data.xmat[self._bodies].reshape(-1, 3, 3)
-        link_matrices[:, :, 3] = data.xpos[self._bodies]
+        qpos[:] = data.qpos
+        qvel[:] = data.qvel
+        poses[:, :4] = data.xquat
+        poses[:, 4:] = data.xpos
 
 
 def build_model(urdf: Path, settings: MujocoSettings, prepared: PreparedObject | None) -> Any:

@@ -24,8 +24,10 @@ from scipy.spatial import ConvexHull
 from tslam_bench import grids
 from tslam_bench.assets.hand import load_hand
 from tslam_bench.assets.store import PreparedObject, load_object
-from tslam_bench.constants import HORIZON, SUBSTEPS
+from tslam_bench.constants import HORIZON, NUM_JOINTS, SUBSTEPS
+from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
 from tslam_bench.tasks.skin import build_skin
 
 QUIET_STEPS = 20
@@ -138,8 +140,9 @@ def count_crossings(name: str, pressing: bool, control_steps: int, num_envs: int
     union = HullUnion(load_object(name))
     hands = Hands(num_envs, BatchSettings(object=name, reward_mode="none"))
     counts, generator = WallCounts(), np.random.Generator(np.random.PCG64(0))
-    links = np.zeros_like(hands.batch._links[0])
-    scratch = np.zeros((2, *hands.arrays["qpos"][0].shape), dtype=np.float32)
+    rows, links = hands.scenes[0].skin_rows(), np.zeros((1, len(SKIN_LINKS), 3, 4), dtype=np.float32)
+    joints = np.zeros((2, NUM_JOINTS), dtype=np.float32)
+    poses = np.zeros((1, hands.scenes[0].num_bodies, POSE_SIZE), dtype=np.float32)
     watches: list[AxisWatch] = []
 
     def watched(env: int) -> Callable[[], None]:
@@ -148,8 +151,9 @@ def count_crossings(name: str, pressing: bool, control_steps: int, num_envs: int
         def step() -> None:
             for _ in range(SUBSTEPS):
                 scene._system.step()
-                scene.read(*scratch, links)
-                watches[env].count(links, counts)
+                scene.read(*joints, poses[0])
+                link_matrices(poses, rows, links)
+                watches[env].count(links[0], counts)
 
         return step
 

@@ -114,8 +114,7 @@ def rest_drift(steps: int = HORIZON - 1, num_envs: int = 8) -> tuple[float, floa
 def tracking_errors(targets: int, num_envs: int = 8) -> NDArray[np.float64]:
     """(n, 28) absolute distance from the target after one second in free space; random targets, ``targets`` per hand.
 
-    Raises:
-        RuntimeError: the hand touched the object, so this was not free space.
+    Hands that touch the object on their way to a target are left out for that target.
     """
     settings = BatchSettings(object="cubesmall", control_mode="pd_joint_pos", reward_mode="none")
     hands, generator = Hands(num_envs, settings), np.random.Generator(np.random.PCG64(0))
@@ -129,12 +128,12 @@ def tracking_errors(targets: int, num_envs: int = 8) -> NDArray[np.float64]:
     for _ in range(targets):
         action = generator.uniform(-1, 1, (num_envs, NUM_JOINTS)).astype(np.float32)
         action[:, HEIGHT] = generator.uniform(0.9, 1.0, num_envs)  # above the object
+        free = np.ones(num_envs, dtype=bool)
         for _ in range(HOLD_STEPS):
             hands.step(action)
-            if hands.arrays["touch"].any():
-                raise RuntimeError("the hand touched the object while its drives were measured")
+            free &= ~hands.arrays["touch"].any(axis=1)
         wanted = control(action, hands.arrays["qpos"])
-        errors.append(np.abs(hands.arrays["qpos"] - wanted))
+        errors.append(np.abs(hands.arrays["qpos"] - wanted)[free])
     return np.concatenate(errors).astype(np.float64)
 
 

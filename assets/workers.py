@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -34,9 +35,18 @@ def _limit_memory(limit: int) -> None:
 def _serve(connection: Connection, function: Callable[..., Any], memory_limit: int = MEMORY_LIMIT) -> None:
     """Worker loop: one job after the other, each on one thread so that workers do not fight for the cores."""
     _limit_memory(memory_limit)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
         while True:
             connection.send(function(*connection.recv()))
+
+
+def _end_with_parent() -> None:
+    """Ends this process once its parent is gone, however that ended: a job can go on for minutes."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 @dataclass

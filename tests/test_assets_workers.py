@@ -1,0 +1,45 @@
+"""Preparing processes do not outlive the command that started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_their_parent_in_the_middle_of_a_job(how):
+    script = textwrap.dedent("""
+        import time
+        from tslam_bench.assets.workers import WorkerPool
+        if __name__ == "__main__":
+            pool = WorkerPool(time.sleep, size=2, time_limit=600.0)
+            for job in range(2):
+                pool.submit(job, (300.0,))
+            print(*(worker.process.pid for worker in pool._workers), flush=True)
+            time.sleep(300)
+    """)
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        workers = [int(pid) for pid in parent.stdout.readline().split()]
+        assert len(workers) == 2
+        time.sleep(2)  # until they work
+        parent.send_signal(how)
+    deadline = time.monotonic() + 30
+    while any(_runs(pid) for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(_runs(pid) for pid in workers)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (ProcessLookupError, FileNotFoundError):
+        return False

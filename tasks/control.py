@@ -46,6 +46,7 @@ class DriveTargets:
         self._half_range = backend.array((limits[:, 1] - limits[:, 0]) / 2)
         self._middle_range = backend.array((limits[:, 1] + limits[:, 0]) / 2)
         self._delta = backend.array(DELTA_STEP.astype(np.float32))
+        self._coupled = backend.array(MIDDLE), backend.array(END)  # on the device: no copy per step
 
     def __call__(self, action: Array, qpos: Array) -> Array:
         """Targets (E, 28) for actions (E, 28), clipped to [-1, 1], at joint positions (E, 28); m and rad."""
@@ -55,31 +56,31 @@ class DriveTargets:
             target = qpos + action * self._delta
         else:
             target = self._middle_range + action * self._half_range
-        coupled = couple(self._clip_to_limits(target), self._backend)
-        return _pull_back(self._clip_to_limits(coupled), self._backend)
+        coupled = _couple(self._clip_to_limits(target), self._backend, *self._coupled)
+        return _pull_back(self._clip_to_limits(coupled), self._backend, *self._coupled)
 
     def _clip_to_limits(self, target: Array) -> Array:
         xp = self._backend.module
         return xp.minimum(xp.maximum(target, self._low), self._high)
 
 
-def couple(target: Array, backend: Backend) -> Array:
+def _couple(target: Array, backend: Backend, middles: Array, ends: Array) -> Array:
     """Projects each finger's middle and end joint onto what its tendon allows: the nearest point of the band."""
-    middle, end = target[:, MIDDLE], target[:, END]
+    middle, end = target[:, middles], target[:, ends]
     stretch = COUPLING_END * end - COUPLING_MIDDLE * middle
     excess = stretch - backend.clip(stretch, -COUPLING_SLACK, COUPLING_SLACK)
     scale = 1.0 / (COUPLING_END**2 + COUPLING_MIDDLE**2)
     coupled = target.copy() if backend.is_numpy else target.clone()
-    coupled[:, MIDDLE] = middle + (COUPLING_MIDDLE * scale) * excess
-    coupled[:, END] = end - (COUPLING_END * scale) * excess
+    coupled[:, middles] = middle + (COUPLING_MIDDLE * scale) * excess
+    coupled[:, ends] = end - (COUPLING_END * scale) * excess
     return coupled
 
 
-def _pull_back(target: Array, backend: Backend) -> Array:
+def _pull_back(target: Array, backend: Backend, middles: Array, ends: Array) -> Array:
     """Straightens the joint that is ahead of its tendon: mends what clipping did to the coupling, inside the limits."""
     xp = backend.module
-    middle, end = target[:, MIDDLE], target[:, END]
+    middle, end = target[:, middles], target[:, ends]
     pulled = target.copy() if backend.is_numpy else target.clone()
-    pulled[:, END] = xp.minimum(end, (COUPLING_SLACK + COUPLING_MIDDLE * middle) * (1.0 / COUPLING_END))
-    pulled[:, MIDDLE] = xp.minimum(middle, (COUPLING_SLACK + COUPLING_END * end) * (1.0 / COUPLING_MIDDLE))
+    pulled[:, ends] = xp.minimum(end, (COUPLING_SLACK + COUPLING_MIDDLE * middle) * (1.0 / COUPLING_END))
+    pulled[:, middles] = xp.minimum(middle, (COUPLING_SLACK + COUPLING_END * end) * (1.0 / COUPLING_MIDDLE))
     return pulled

@@ -59,19 +59,22 @@ class HandController(BaseController):
     def set_action(self, action: torch.Tensor) -> None:
         """Sets the drive targets for actions (E, 28) in [-1, 1]."""
         if self._setters is None:
-            self.articulation.set_joint_drive_targets(
-                self._targets(action.to(torch.float32), self.qpos), self.joints, self.active_joint_indices
-            )
+            self._set_device_targets(self._targets(action.to(torch.float32), self.qpos))  # GPU only
             return
         qpos = self.articulation._objs[0].qpos[self._order]
         targets = self._targets(action.numpy().astype(np.float32, copy=False), qpos[None])
         for setter, target in zip(self._setters, targets[0].tolist(), strict=True):
             setter(target)
 
+    def _set_device_targets(self, targets: torch.Tensor) -> None:
+        """Writes (E, 28) targets of all hands. ManiSkill's setter masks the rows, which waits for the device each step."""
+        rows, columns = self.articulation.get_joint_target_indices(self.joints)  # GPU only
+        self.articulation.px.cuda_articulation_target_qpos.torch()[rows, columns] = targets  # GPU only
+
     def hold(self) -> None:
         """Makes the current joint positions the targets (start of an episode)."""
         if self._setters is None:
-            self.articulation.set_joint_drive_targets(self.qpos, self.joints, self.active_joint_indices)
+            self._set_device_targets(self.qpos)  # GPU only
             return
         qpos = self.articulation._objs[0].qpos[self._order]
         for setter, target in zip(self._setters, qpos.tolist(), strict=True):
@@ -120,6 +123,7 @@ class AdroitHand(BaseAgent):
         index = [self.robot.active_joints_map[name].active_index[0].item() for name in JOINT_NAMES]
         self.joint_order = np.array(index)
         """Position of each joint of ``JOINT_NAMES`` in the simulator's own order."""
+        self.device_joint_order = torch.as_tensor(self.joint_order, device=self.device)
         self.skin_links = [self.robot.links_map[name] for name in SKIN_LINKS]
         self._raw_skin_links = [link._objs[0] for link in self.skin_links]
         self._scene_of_rows: Any = None

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.assets.store import PreparedObject, list_objects, load_object
+from tslam_bench.assets.store import PreparedObject, list_objects, load_object, read_record, resolve_name
 from tslam_bench.constants import NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
@@ -86,6 +86,11 @@ class StartSampler:
             raise InvalidInputError(
                 f"split {split!r}: no objects to draw from; run 'tslam-bench assets prepare --split {split}'"
             )
+
+    def most_hulls(self) -> int:
+        """Hulls of the object that has the most of them."""
+        records = (read_record(resolve_name(name, self.split), self.split) for name in self.names)
+        return max(record.get("hull_count") or len(self.load(record["name"]).hulls) for record in records)
 
     def load(self, name: str) -> PreparedObject:
         """An object of the split; the latest ``LOADED_OBJECTS`` stay in memory."""

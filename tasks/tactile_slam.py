@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import sapien
@@ -16,7 +16,7 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register
 from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.pose import Pose
-from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+from mani_skill.utils.structs.types import DefaultMaterialsConfig, GPUMemoryConfig, SceneConfig, SimConfig
 from sapien import physx
 
 from tslam_bench.assets.hand import load_hand
@@ -39,6 +39,7 @@ from tslam_bench.hand_constants import (
 from tslam_bench.tasks import physics
 from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
 from tslam_bench.tasks.compiled_sensing import CompiledSensing
+from tslam_bench.tasks.gpu_memory import gpu_memory
 from tslam_bench.tasks.hand_agent import AdroitHand
 from tslam_bench.tasks.rendering import vulkan_device_available
 from tslam_bench.tasks.rewards import Rewards
@@ -46,6 +47,9 @@ from tslam_bench.tasks.sensing import Contacts, TactileSensing
 from tslam_bench.tasks.skin import build_skin
 from tslam_bench.tasks.starts import StartSampler
 from tslam_bench.variants import FREE, TABLETOP, Variant
+
+MAX_GPU_ENVIRONMENTS: Final = 1 << 16
+"""More sub-scenes than this on one GPU are a slip of the pen."""
 
 
 class TactileSLAMEnv(BaseEnv):
@@ -126,6 +130,9 @@ class TactileSLAMEnv(BaseEnv):
                 f"num_envs {num_envs}, sim_backend {kwargs.get('sim_backend', 'auto')!r}: batched simulation needs a GPU and "
                 "there is none (CUDA); make environments with num_envs=1 instead"
             )
+        if wants_gpu and num_envs > MAX_GPU_ENVIRONMENTS:
+            raise InvalidInputError(f"num_envs {num_envs}: must be a whole number from 1 to {MAX_GPU_ENVIRONMENTS}")
+        self._wants_gpu, self._asked_num_envs = wants_gpu, num_envs
         self._starts = StartSampler(object, objects, split, pose, self.VARIANT)
         self.split = split
         self.object_name: list[str] = [""] * num_envs
@@ -168,7 +175,17 @@ class TactileSLAMEnv(BaseEnv):
             default_materials_config=DefaultMaterialsConfig(
                 physics.STATIC_FRICTION, physics.DYNAMIC_FRICTION, physics.RESTITUTION
             ),
+            gpu_memory_config=self._gpu_memory_config() if self._wants_gpu else GPUMemoryConfig(),
         )
+
+    def _gpu_memory_config(self) -> GPUMemoryConfig:
+        """PhysX's buffers for the number of environments and the object with the most hulls."""
+        return GPUMemoryConfig(**vars(gpu_memory(self._asked_num_envs, self._starts.most_hulls())))
+
+    @property
+    def uses_tensors(self) -> bool:
+        """Whether sensing, rewards and observations are computed with torch on the device rather than numpy on the host."""
+        return self.gpu_sim_enabled
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -212,21 +229,21 @@ class TactileSLAMEnv(BaseEnv):
         super()._load_agent(options, AdroitHand.base_pose())
 
     def _load_scene(self, options: dict) -> None:
-        self._arrays: Backend = TorchBackend(self.device) if self.gpu_sim_enabled else NumpyBackend()
+        self._arrays: Backend = TorchBackend(self.device) if self.uses_tensors else NumpyBackend()
         skin = build_skin(load_hand().shapes)
         self._sensing = (
             TactileSensing(self.num_envs, skin, self._arrays)
-            if self.gpu_sim_enabled
+            if self.uses_tensors
             else CompiledSensing(self.num_envs, skin)
         )
         self._rewards = None
         if self._reward_mode != "none":
             self._rewards = Rewards(self._reward_mode, self.num_envs, self._arrays)
         if self.gpu_sim_enabled:
-            self._load_gpu_objects(options)
+            self._load_gpu_objects(options)  # GPU only
 
     def _load_gpu_objects(self, options: dict) -> None:
-        """One body per sub-scene, fixed until the next reconfigure: a GPU scene cannot gain bodies. Not run on a GPU yet."""
+        """One body per sub-scene, fixed until the next reconfigure: a GPU scene cannot gain bodies."""  # GPU only
         entities = []
         for env in range(self.num_envs):
             name = options["object"][env] if "object" in options else None
@@ -261,10 +278,17 @@ class TactileSLAMEnv(BaseEnv):
                 raise InvalidInputError(
                     f"options[{key!r}]: {len(options[key])} values for {self.num_envs} environments; give one each"
                 )
-        for name in options.get("object", ()):
-            self._starts.load(name)
+        for env, name in enumerate(options.get("object", ())):
+            known = self._starts.load(name).name
+            if self.gpu_sim_enabled and not options.get("reconfigure") and known != self.object_name[env]:  # GPU only
+                raise InvalidInputError(
+                    f"options['object']: a GPU scene keeps its objects ({self.object_name[env]!r} in environment {env}); "
+                    "add options['reconfigure'] = True"
+                )
         for pose in options.get("pose", ()):
             self.VARIANT.check_pose(pose)
+        if isinstance(seed, (int, np.integer)) and self.num_envs > 1:  # environment i is seed + i, as in make_vec
+            seed = list(range(int(seed), int(seed) + self.num_envs))  # GPU only
         return super().reset(seed=seed, options=options)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -275,7 +299,7 @@ class TactileSLAMEnv(BaseEnv):
             name = options["object"][env] if "object" in options else None
             prepared = self._starts.draw_object(rng, name)
             if self.gpu_sim_enabled:  # bodies are fixed until the next reconfigure
-                prepared = self._starts.load(self.object_name[env])
+                prepared = self._starts.load(self.object_name[env])  # GPU only
             start = self._starts.draw(rng, pose=options["pose"][env] if "pose" in options else None, prepared=prepared)
             starts.append(start)
             self.object_name[env], self.pose[env] = prepared.name, start.pose
@@ -285,7 +309,7 @@ class TactileSLAMEnv(BaseEnv):
         order = np.argsort(self.agent.joint_order)  # from JOINT_NAMES to the simulator's order
         qpos = np.stack([start.qpos for start in starts])[:, order]
         if self.gpu_sim_enabled:
-            self._place_gpu_objects(env_idx, qpos)
+            self._place_gpu_objects(env_idx, qpos)  # GPU only
         else:
             self._fresh_physics(starts[0].prepared, starts[0].pose, qpos[0])
         self._sensing.begin(envs)
@@ -293,13 +317,13 @@ class TactileSLAMEnv(BaseEnv):
             self._rewards.begin(envs)
         self._contacts = None
         self._reward = None
-        if not self.gpu_sim_enabled and bool(self._sensing.touches(self.agent.host_skin_matrices()).any()):
+        if not self.uses_tensors and bool(self._sensing.touches(self.agent.host_skin_matrices()).any()):
             raise AssetError(
                 f"{self.object_name[0]}: touches the hand at the start, so it does not fit in the workspace"
             )
 
     def _place_gpu_objects(self, env_idx: torch.Tensor, qpos: np.ndarray) -> None:
-        """Turns the objects and places the hands of ``env_idx``. Not run on a GPU yet."""
+        """Turns the objects and places the hands of ``env_idx``."""  # GPU only
         quaternions = np.stack([physics.pose_quaternion(self.pose[env]) for env in env_idx.tolist()])
         position = torch.zeros((len(env_idx), 3), device=self.device)
         rotation = torch.tensor(quaternions, dtype=torch.float32, device=self.device)
@@ -382,7 +406,7 @@ class TactileSLAMEnv(BaseEnv):
     def _step_action(self, action: Any) -> Any:
         action = super()._step_action(action)
         step = self._elapsed_steps  # counted up after the action
-        if self.gpu_sim_enabled:
+        if self.uses_tensors:
             self._contacts = self._sensing.step(self.agent.device_skin_matrices(), step)
         else:
             self._contacts = self._sensing.step(self.agent.host_skin_matrices(), step.numpy())
@@ -414,8 +438,8 @@ class TactileSLAMEnv(BaseEnv):
         return {**self._get_obs_agent(), **self._get_obs_extra(info)}
 
     def _get_obs_agent(self) -> dict[str, torch.Tensor]:
-        if self.gpu_sim_enabled:
-            order = torch.as_tensor(self.agent.joint_order, device=self.device)
+        if self.uses_tensors:
+            order = self.agent.device_joint_order
             return {"qpos": self.agent.robot.get_qpos()[:, order], "qvel": self.agent.robot.get_qvel()[:, order]}
         return {"qpos": torch.from_numpy(self.agent.host_qpos()), "qvel": torch.from_numpy(self.agent.host_qvel())}
 

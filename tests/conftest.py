@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: its threads wait for each other on small tensors
+
 import pytest
 from objects import prepared_box, prepared_sphere, prepared_torus
 

@@ -15,6 +15,7 @@ _COMMANDS = {
     "reconstruct": ("tslam_bench.reconstruction.commands", "main", "train and run reconstructors"),
     "score": ("tslam_bench.leaderboard.commands", "score_main", "score submissions: a table and JSON"),
     "leaderboard": ("tslam_bench.leaderboard.commands", "page_main", "rank scored submissions and build the page"),
+    "gpu-check": ("tslam_bench.tasks.gpu_check_command", "main", "compare the GPU simulation with the CPU's"),
     "env": ("tslam_bench.tasks.commands", "main", "list environments, describe their spaces, record a video"),
 }
 

@@ -1,0 +1,257 @@
+"""What a GPU runs, as far as it can be run without one: the torch code on real simulation data, no waiting for the device,
+memory sizes, and the comparison behind ``tslam-bench gpu-check``."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import tslam_bench
+from tslam_bench.assets.hand import load_hand
+from tslam_bench.assets.store import load_object
+from tslam_bench.cli import main
+from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS, REWARD_MODES
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import CONTROL_MODES, SKIN_LINKS
+from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
+from tslam_bench.tasks.batch import BatchSettings, HandBatch, batch_arrays
+from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
+from tslam_bench.tasks.control import DriveTargets
+from tslam_bench.tasks.gpu_check import Episodes, compare, judge, record
+from tslam_bench.tasks.gpu_memory import CONTACTS_PER_PAIR, HAND_SHAPES, TOUCHING_PAIRS, gpu_memory
+from tslam_bench.tasks.native_output import captured_output
+from tslam_bench.tasks.rewards import Rewards
+from tslam_bench.tasks.sensing import TactileSensing
+from tslam_bench.tasks.skin import build_skin
+from tslam_bench.tasks.tactile_slam import TactileSLAMEnv
+
+ENVS, STEPS = 4, 70
+EPISODES = Episodes.draw(("mug", "hammer"), (0, 2, 5), ENVS)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """Link poses (T, E, L, 3, 4), joint positions (T, E, 28) and actions of real episodes."""
+    arrays = {name: np.zeros((ENVS, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
+    batch = HandBatch(ENVS, BatchSettings(objects=("mug", "hammer"), reward_mode="none"), arrays)
+    batch.reset(list(EPISODES.seeds), list(range(ENVS)), list(EPISODES.objects), list(EPISODES.poses))
+    links, qpos = [], []
+    for action in EPISODES.actions[:STEPS]:
+        qpos.append(arrays["qpos"].copy())
+        arrays["action"][:] = action
+        batch.step()
+        links.append(batch._links.copy())
+    return np.stack(links), np.stack(qpos), EPISODES.actions[:STEPS]
+
+
+def begun(backend, mode: str) -> tuple[TactileSensing, Rewards]:
+    sensing = TactileSensing(ENVS, build_skin(load_hand().shapes), backend)
+    rewards = Rewards(mode, ENVS, backend)
+    for env, (name, pose) in enumerate(zip(EPISODES.objects, EPISODES.poses, strict=True)):
+        prepared = load_object(name)
+        sensing.set_object(env, name, prepared.field, pose)
+        rewards.set_object(env, prepared, pose)
+    sensing.begin(range(ENVS))
+    rewards.begin(range(ENVS))
+    return sensing, rewards
+
+
+class Dense(TorchBackend):
+    """The device's way of selecting probes (all of them), on any device."""
+
+    def select(self, mask):
+        count, width = mask.shape
+        flat = torch.arange(count * width, device=self.device)
+        return flat // width, flat % width
+
+
+@pytest.mark.parametrize("mode", REWARD_MODES)
+def test_torch_on_real_episodes_is_numpy_in_every_reward_mode(simulated, mode):
+    links, _, _ = simulated
+    host, host_rewards = begun(NumpyBackend(), mode)  # test_sensing compares the compiled sensing with it
+    device, device_rewards = begun(Dense("cpu"), mode)
+    felt = 0
+    for step in range(STEPS):
+        a = host.step(links[step], np.full(ENVS, step))
+        b = device.step(torch.from_numpy(links[step]), torch.full((ENVS,), step))
+        felt += int(a.on.sum())
+        np.testing.assert_array_equal(a.on, b.on.numpy())
+        np.testing.assert_array_equal(host.link_touch(), device.link_touch().numpy())
+        expected, found = host_rewards.step(a), device_rewards.step(b)
+        assert found.dtype == torch.float32 and found.shape == (ENVS,)
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-3, atol=1e-3, err_msg=f"step {step}")
+    for name in ("touched", "visited", "touched_step"):
+        np.testing.assert_array_equal(getattr(host, name), getattr(device, name).numpy(), err_msg=name)
+    assert felt > 500, "the comparison has to include contact"
+
+
+@pytest.mark.parametrize("control_mode", CONTROL_MODES)
+def test_torch_drive_targets_are_numpys(simulated, control_mode):
+    _, qpos, actions = simulated
+    host, device = DriveTargets(control_mode, NumpyBackend()), DriveTargets(control_mode, TorchBackend("cpu"))
+    for step in range(0, STEPS, 7):
+        expected = host(1.5 * actions[step], qpos[step])
+        found = device(torch.from_numpy(1.5 * actions[step]), torch.from_numpy(qpos[step]))
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6, atol=1e-6)
+
+
+class NoHostCopies(TorchDispatchMode):
+    """Refuses operations that wait for the device or copy between it and the host."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = str(func)
+        host = [a for a in torch.utils._pytree.tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
+        mixed = {a.device.type for a in host if a.dim() > 0} | {str((kwargs or {}).get("device") or "meta")}
+        if "_local_scalar_dense" in name or "nonzero" in name or "cpu" in mixed:
+            raise AssertionError(f"{name} waits for the device or copies from or to the host")
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("mode", REWARD_MODES)
+def test_a_step_makes_no_host_copies(mode):
+    """On torch's meta device nothing has a value: whatever asks for one fails. ``disagreement`` has to: qhull is on the host."""
+    backend = Dense("meta")
+    sensing, rewards = begun(backend, mode)
+    targets = DriveTargets(CONTROL_MODES[0], backend)
+    links = torch.zeros((ENVS, len(SKIN_LINKS), 3, 4), device="meta")
+    steps = torch.zeros(ENVS, dtype=torch.int32, device="meta")
+    action, qpos = (torch.zeros((ENVS, NUM_JOINTS), device="meta") for _ in range(2))
+
+    def step():
+        with NoHostCopies():
+            assert targets(action, qpos).shape == (ENVS, NUM_JOINTS)
+            contacts = sensing.step(links, steps)
+            sensing.link_touch()
+            assert rewards.step(contacts).shape == (ENVS,)
+
+    if mode == "disagreement":
+        with pytest.raises((AssertionError, NotImplementedError, RuntimeError)):
+            step()
+    else:
+        step()
+        step()
+
+
+def test_the_check_for_host_copies_can_fail():
+    value = torch.zeros(3, device="meta")
+    for copies in (lambda: value.sum().item(), lambda: value[torch.tensor([0, 1])], lambda: value.to("cpu")):
+        with pytest.raises((AssertionError, RuntimeError, NotImplementedError)), NoHostCopies():
+            copies()
+
+
+class TensorTask(TactileSLAMEnv):
+    """The task with the sensing, rewards and observations that a GPU uses, simulated on the CPU."""
+
+    uses_tensors = True
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    """Three episodes: by the CPU engine, again with perturbed actions, and by the tensor path one by one."""
+    episodes = Episodes.draw(("mug", "hammer"), (0, 5), 3)
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", objects=("mug", "hammer"), processes=1)
+    reference, perturbed = record(envs, episodes), record(envs, episodes.perturbed())
+    envs.close()
+    batched = BatchedVectorEnv(TensorTask(objects=("mug", "hammer")))
+    parts = []
+    for env in range(3):
+        one = slice(env, env + 1)
+        parts.append(
+            record(
+                batched,
+                Episodes(episodes.objects[one], episodes.poses[one], episodes.seeds[one], episodes.actions[:, one]),
+            )
+        )
+    batched.close()
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts], axis=0 if name in ("touched", "visited") else 1)
+        for name in ("touch", "qpos", "rewards", "touched", "visited")
+    }
+    return reference, perturbed, replace(parts[0], **joined)
+
+
+def test_the_tensor_path_passes_the_check_against_the_cpu_engine(recordings):
+    reference, perturbed, tensors = recordings
+    found, yardstick = compare(reference, tensors), compare(reference, perturbed)
+    assert found.contacts > 100 and found.touch > 0.99 and found.touched_iou > 0.98 and found.visited_iou > 0.99
+    assert found.free_motion == 0, "same physics, same bits"
+    assert yardstick.touch < 1 and 0 < yardstick.free_motion < 5e-3, "the yardstick is no copy"
+    assert all(finding.passed for finding in judge(found, yardstick))
+
+
+def test_the_check_fails_where_it_should(recordings):
+    reference, perturbed, _ = recordings
+    yardstick = compare(reference, perturbed)
+    broken = {
+        "touch": replace(reference, touch=np.roll(reference.touch, 1, axis=2)),
+        "touched_iou": replace(reference, touched=np.roll(reference.touched, 3, axis=1)),
+        "visited_iou": replace(reference, visited=np.roll(reference.visited, 5, axis=1)),
+        "mean_return": replace(reference, rewards=2 * reference.rewards),
+        "free_motion": replace(reference, qpos=reference.qpos + np.float32(0.02)),
+    }
+    for name, other in broken.items():
+        failed = {finding.name for finding in judge(compare(reference, other), yardstick) if not finding.passed}
+        assert name in failed, name
+    silent = replace(reference, touch=np.zeros_like(reference.touch))
+    assert "contacts" in {f.name for f in judge(compare(silent, silent), yardstick) if not f.passed}
+    same = compare(reference, reference)
+    assert (same.touch, same.touched_iou, same.visited_iou, same.mean_return, same.free_motion) == (1, 1, 1, 0, 0)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_command_says_so_in_one_line(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["gpu-check", "--num-envs", "4"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        "tslam-bench: gpu-check: there is no CUDA GPU that torch can use; run it on a machine that has one\n"
+    )
+
+
+def test_memory_grows_with_environments_and_hulls():
+    small, default = gpu_memory(1, 1), gpu_memory(1024, 40)
+    assert small.max_rigid_contact_count == 2**19 and small.max_rigid_patch_count == 2**18
+    assert default.max_rigid_patch_count >= 1024 * TOUCHING_PAIRS
+    assert default.max_rigid_contact_count >= 1024 * TOUCHING_PAIRS * CONTACTS_PER_PAIR
+    many = gpu_memory(8192, 128)
+    assert many.max_rigid_contact_count >= 8192 * TOUCHING_PAIRS * CONTACTS_PER_PAIR
+    assert many.found_lost_pairs_capacity >= 2 * 8192 * HAND_SHAPES * 129
+    assert len(load_hand().shapes) == HAND_SHAPES
+    for value in vars(many).values():
+        assert value & (value - 1) == 0, "a power of two"
+    with pytest.raises(InvalidInputError, match="use fewer environments"):
+        gpu_memory(1 << 20, 128)
+
+
+def test_overflows_in_native_output_are_found():
+    with captured_output() as output:
+        os.write(1, b"harmless line\n")
+        os.write(2, b"Contact buffer overflow detected, please increase its size to at least 600000\n")
+    assert len(output.overflows()) == 1 and "600000" in output.overflows()[0]
+    with captured_output() as output:
+        os.write(2, b"all is well\n")
+    assert output.overflows() == []
+
+
+def test_the_list_of_lines_that_only_a_gpu_reaches_is_current():
+    script = Path(__file__).parent.parent / "docs" / "build_gpu.py"
+    subprocess.run([sys.executable, str(script), "--check"], check=True)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, so these are no errors")
+@pytest.mark.parametrize(
+    "arguments", [{"num_envs": 2}, {"num_envs": 70_000}, {"sim_backend": "physx_cuda"}, {"sim_backend": "cuda:3"}]
+)
+def test_cuda_where_there_is_none_is_one_line(arguments):
+    with pytest.raises(InvalidInputError, match="needs a GPU and there is none") as caught:
+        gym.make(ENVIRONMENT_ID, object="mug", **arguments)
+    assert "\n" not in str(caught.value)

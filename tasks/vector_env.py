@@ -18,6 +18,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from tslam_bench.assets.store import resolve_name
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
@@ -62,6 +63,7 @@ class TactileVectorEnv(VectorEnv):
         num_envs: environments in all.
         settings: objects, pose, reward mode, control mode.
         processes: worker processes; None means the cores, but no more than there are environments.
+        timeout: seconds after which a worker that does not answer a step counts as hung.
 
     Raises:
         InvalidInputError: a bad number of environments or processes, unknown object, pose, reward or control mode.
@@ -71,13 +73,19 @@ class TactileVectorEnv(VectorEnv):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(self, num_envs: int, settings: BatchSettings, processes: int | None = None) -> None:
+    def __init__(
+        self, num_envs: int, settings: BatchSettings, processes: int | None = None, timeout: float = STEP_TIMEOUT
+    ) -> None:
         for name, value, low, high in (
             ("num_envs", num_envs, 1, MAX_ENVIRONMENTS),
             ("processes", 1 if processes is None else processes, 1, 256),
         ):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
                 raise InvalidInputError(f"{name} {value!r}: must be a whole number from {low} to {high}")
+        if not isinstance(timeout, (int, float)) or not 0 < timeout < float("inf"):
+            raise InvalidInputError(f"timeout {timeout!r}: must be a number of seconds above 0")
+        self._timeout = float(timeout)
+        self._split = settings.split
         self._variant = settings.sampler().variant  # fail here, in one line, rather than in a worker
         self.num_envs = int(num_envs)
         self.single_observation_space = observation_space()
@@ -138,6 +146,9 @@ class TactileVectorEnv(VectorEnv):
         poses = self._option(options, "pose")
         for pose in poses or ():
             self._variant.check_pose(pose)
+        for name in names or ():
+            if name is not None:
+                resolve_name(name, self._split)
         for part, (_, pipe) in zip(self._slices, self._workers, strict=True):
             envs = np.flatnonzero(mask[part]).tolist()
             chosen = [part.start + env for env in envs]
@@ -162,7 +173,7 @@ class TactileVectorEnv(VectorEnv):
         self._arrays["action"][:] = self._checked(actions)
         for _, pipe in self._workers:
             self._send(pipe, _STEP)
-        self._collect(STEP_TIMEOUT)
+        self._collect(self._timeout)
         truncated = self._arrays["truncated"].copy()
         info = self._info()
         if truncated.any():
@@ -178,7 +189,7 @@ class TactileVectorEnv(VectorEnv):
         self._check_open()
         for _, pipe in self._workers:
             self._send(pipe, ("state", None))
-        parts = self._collect(STEP_TIMEOUT)
+        parts = self._collect(self._timeout)
         return {
             "object_name": [name for part in parts for name in part["object_name"]],
             "pose": [pose for part in parts for pose in part["pose"]],
@@ -236,7 +247,7 @@ class TactileVectorEnv(VectorEnv):
             if not ready:
                 silent = next(index for index in range(len(self._workers)) if index not in answers)
                 self._stop()
-                raise WorkerError(f"worker {silent}: no answer for {timeout:.0f} s; all workers were stopped")
+                raise WorkerError(f"worker {silent}: no answer for {timeout:g} s; all workers were stopped")
             for key, _ in ready:
                 process, pipe = self._workers[key.data]
                 try:

@@ -100,7 +100,12 @@ def test_spaces_options_and_partial_resets():
     [
         ({"num_envs": 0}, "num_envs 0: must be a whole number from 1"),
         ({"num_envs": 10**9}, "num_envs 1000000000"),
+        ({"num_envs": -3}, "num_envs -3"),
+        ({"num_envs": 2.0}, r"num_envs 2\.0: must be a whole number"),
+        ({"num_envs": True}, "num_envs True"),
+        ({"num_envs": "many"}, "num_envs 'many'"),
         ({"num_envs": 2, "processes": 0}, "processes 0"),
+        ({"num_envs": 2, "timeout": 0}, "timeout 0: must be a number of seconds above 0"),
         ({"num_envs": 2, "device": "tpu"}, "device 'tpu': unknown"),
         ({"num_envs": 2, "object": "mugg"}, "mugg"),
         ({"num_envs": 2, "pose": 9}, "pose 9"),
@@ -127,6 +132,9 @@ def test_bad_actions_and_dead_workers():
         (good[:1], r"shape \(1, 28\), expected \(2, 28\)"),
         (np.where(np.arange(NUM_JOINTS) == 1, np.nan, good), "not finite for joint ARTy of environment 0"),
         ("up", "not an array of numbers"),
+        (np.full((2, NUM_JOINTS), np.inf), "not finite for joint ARTx of environment 0"),
+        (np.full((2, NUM_JOINTS), "a"), "not an array of numbers"),
+        (None, r"shape \(\)"),
     ):
         with pytest.raises(InvalidInputError, match=message):
             envs.step(bad)
@@ -139,6 +147,39 @@ def test_bad_actions_and_dead_workers():
             envs.step(good)
     assert time.monotonic() - started < 20
     assert not any(process.is_alive() for process in processes), "no worker is left behind"
+
+
+@pytest.mark.parametrize("request_name", ["step", "state"])
+def test_a_hung_worker_is_found_within_the_timeout(request_name):
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2, timeout=3.0)
+    envs.reset(seed=0)
+    processes = [process for process, _ in envs._workers]
+    os.kill(processes[0].pid, signal.SIGSTOP)
+    started = time.monotonic()
+    with pytest.raises(WorkerError, match="worker 0: no answer for 3 s; all workers were stopped") as caught:
+        envs.step(np.zeros((2, NUM_JOINTS), np.float32)) if request_name == "step" else envs.state()
+    assert "\n" not in str(caught.value) and 2.5 < time.monotonic() - started < 60
+    assert not any(process.is_alive() for process in processes), "a stopped worker is killed, none is left behind"
+    with pytest.raises(WorkerError, match="closed"):
+        envs.reset()
+
+
+def test_refused_options_harm_nothing():
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=1)
+    envs.reset(seed=0)
+    for options, message in (
+        ({"object": "mugg"}, "mugg"),
+        ({"object": ["mug"]}, r"options\['object'\]: 1 values for 2 environments"),
+        ({"pose": 8}, "pose 8"),
+        ({"reset_mask": np.ones(3, dtype=bool)}, "reset_mask"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            envs.reset(options=options)
+    with pytest.raises(InvalidInputError, match="seed: 3 values for 2 environments"):
+        envs.reset(seed=[1, 2, 3])
+    observation, *_ = envs.step(np.zeros((2, NUM_JOINTS), np.float32))
+    assert (observation["time"] > 0).all()
+    envs.close()
 
 
 def test_nothing_is_left_when_the_parent_is_killed():

@@ -34,6 +34,7 @@ def make_vec(
     reward_mode: str = "tslam",
     control_mode: str = "pd_joint_delta_pos",
     processes: int | None = None,
+    timeout: float = 60.0,
 ) -> gymnasium.vector.VectorEnv:
     """A Gymnasium vector environment (1.x semantics, autoreset ``SAME_STEP``) of many hands.
 
@@ -52,6 +53,7 @@ def make_vec(
         reward_mode: see the environment.
         control_mode: see the environment.
         processes: CPU worker processes; None means the cores.
+        timeout: seconds after which a CPU worker that does not answer a step counts as hung.
 
     Raises:
         InvalidInputError: unknown id, device, object, pose or mode; CUDA asked for where there is none.
@@ -80,7 +82,7 @@ def make_vec(
 
     chosen = None if objects is None else tuple(objects)
     settings = BatchSettings(object, chosen, split, pose, reward_mode, control_mode, environment_id)
-    return TactileVectorEnv(num_envs, settings, processes)
+    return TactileVectorEnv(num_envs, settings, processes, timeout)
 
 
 def _cuda_available() -> bool:

@@ -36,8 +36,8 @@ def gpu_memory(num_envs: int, hulls: int) -> GpuMemory:
     * contacts: ``CONTACTS_PER_PAIR`` times that;
     * found and lost pairs: ``2 * num_envs * HAND_SHAPES * (hulls + 1)``, all pairs appearing and vanishing in one step;
     * each rounded up to a power of two and not below ManiSkill's defaults, which small scenes keep;
-    * collision stack: 4 KiB for each touching pair; heap and temporary buffer: ManiSkill's defaults, doubled with each
-      doubling of the environments above 1,024.
+    * collision stack: 256 bytes for each touching pair (an estimate); heap and temporary buffer: ManiSkill's defaults,
+      doubled with each doubling of the environments above 1,024.
 
     Raises:
         InvalidInputError: PhysX cannot count that many.
@@ -51,7 +51,7 @@ def gpu_memory(num_envs: int, hulls: int) -> GpuMemory:
         found_lost_pairs_capacity=max(2**25, _power_of_two(2 * num_envs * pairs)),
         temp_buffer_capacity=2**24 * growth,
         heap_capacity=2**26 * growth,
-        collision_stack_size=max(2**22, _power_of_two(4096 * touching)),
+        collision_stack_size=max(2**22, _power_of_two(256 * touching)),
     )
     if max(vars(sizes).values()) > LARGEST_MEMORY:
         raise InvalidInputError(

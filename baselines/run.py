@@ -81,7 +81,7 @@ QUICK_TRAINING_OBJECTS: Final = (
     "cooking-pot-000",
     "teapot-000",
     "plate-000",
-    "jar-000",
+    "padlock-000",
     "candlestick-000",
     "mallet-000",
     "screwdriver-000",
@@ -91,13 +91,13 @@ QUICK_TRAINING_OBJECTS: Final = (
     "key-000",
     "comb-000",
     "carton-000",
-    "remote-control-000",
+    "spectacles-000",
     "toaster-000",
     "book-000",
     "bangle-000",
     "picture-frame-000",
 )
-"""Generated train objects of the quick run, by name: what else is prepared must not change its results."""
+"""Generated train objects of the quick run that pass the gates, by name: what else is prepared must not change its results."""
 QUICK_VALIDATION_OBJECTS: Final = (
     "bucket-000",
     "mushroom-000",

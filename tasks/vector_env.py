@@ -115,7 +115,7 @@ class TactileVectorEnv(VectorEnv):
                 theirs.close()
                 self._selector.register(ours, selectors.EVENT_READ, len(self._workers))
                 self._workers.append((process, ours))
-            self._collect(START_TIMEOUT)
+            self._collect(START_TIMEOUT, "a script has to make it below 'if __name__ == \"__main__\":'")
         except BaseException:
             self._stop()
             raise
@@ -238,7 +238,7 @@ class TactileVectorEnv(VectorEnv):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             pipe.send(message)
 
-    def _collect(self, timeout: float) -> list[Any]:
+    def _collect(self, timeout: float, remedy: str = "make a new environment") -> list[Any]:
         """One answer from every worker, in order; stops all of them and raises if any fails."""
         answers: dict[int, Any] = {}
         deadline = time.monotonic() + timeout
@@ -256,8 +256,7 @@ class TactileVectorEnv(VectorEnv):
                     process.join(5)
                     self._stop()
                     raise WorkerError(
-                        f"worker {key.data}: died (exit code {process.exitcode}); all workers were stopped, "
-                        "make a new environment"
+                        f"worker {key.data}: died (exit code {process.exitcode}); all workers were stopped, {remedy}"
                     ) from None
                 if kind == "error":
                     self._stop()

@@ -25,7 +25,9 @@ QUICK_GENERATED = {"train": 24, "val": 6}
 """Generated objects of the quick run."""
 FULL_GENERATED = {"train": 600, "val": 60}
 """Objects of a set that is generated only."""
-ADDED_ROUNDS = {"train": 4, "val": 5}
+FURNITURE_PER_CATEGORY = 15
+"""Real models that one category gives the default set, so that chairs and tables do not fill it."""
+ADDED_ROUNDS = {"train": 6, "val": 5}
 """Generated objects per category that the default set has beside the real ones."""
 
 
@@ -206,7 +208,8 @@ def _training_sources(command: Prepare, split: str) -> tuple[list[Any], list[Any
             generate.candidates(split, rounds=200 if only_generated or command.objects else ADDED_ROUNDS[split])
         )
     if not only_generated and not _all_known(command.objects, generated):
-        real = list(furniture.furniture(split, cache_directory()))
+        limit = FURNITURE_PER_CATEGORY if command.source == "all" and not command.objects else None
+        real = furniture.furniture(split, cache_directory(), limit)
     return generated, real
 
 

@@ -233,8 +233,10 @@ def category_of(title: str) -> str | None:
     return next((category for category, pattern in _CATEGORIES if re.search(pattern, lowered)), None)
 
 
-def furniture(split: str, cache: Path) -> list[FurnitureSource]:
+def furniture(split: str, cache: Path, per_category: int | None = None) -> list[FurnitureSource]:
     """The models of a split in a fixed, mixed order: one of each category, then the next of each.
+
+    ``per_category`` is the most that one category gives (default: all it has).
 
     Raises:
         AssetError: the package cannot be fetched or read.
@@ -265,7 +267,7 @@ def furniture(split: str, cache: Path) -> list[FurnitureSource]:
                     rotation=rotation,
                 )
             )
-    return list(_in_turn(by_category))
+    return list(_in_turn({category: models[:per_category] for category, models in by_category.items()}))
 
 
 def _in_turn(groups: dict[str, list[FurnitureSource]]) -> Iterator[FurnitureSource]:

@@ -27,7 +27,7 @@ FULL_GENERATED = {"train": 600, "val": 60}
 """Objects of a set that is generated only."""
 FURNITURE_PER_CATEGORY = 15
 """Real models that one category gives the default set, so that chairs and tables do not fill it."""
-ADDED_ROUNDS = {"train": 6, "val": 5}
+ADDED_ROUNDS = {"train": 5, "val": 5}
 """Generated objects per category that the default set has beside the real ones."""
 
 

@@ -246,7 +246,7 @@ def test_mutants_are_accepted_whole_or_refused_with_a_reason(tmp_path):
     words = {
         "vertex not a number": "finite",
         "vertex infinite": "finite",
-        "flat": "sheet",
+        "flat": "volume",
         "no faces": "triangles",
         "one point": "extent",
         "metres: 40 m": "unit",

@@ -34,5 +34,6 @@ step "$PYTHON" -m ruff check .
 step "$PYTHON" -m ruff format --check .
 step bash tests/typecheck.sh
 step "$PYTHON" -m tslam_bench.cli assets prepare --quick
+step "$PYTHON" -m tslam_bench.cli assets prepare --objects cubemedium cubesmall  # of the fidelity tests
 step "$PYTHON" docs/build_environment.py --check
 step "$PYTHON" -m pytest "${markers[@]}" "$@"

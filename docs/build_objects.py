@@ -1,4 +1,4 @@
-"""Writes the tables of docs/objects.md from the manifests, and the contact sheets in docs/objects/ from the asset cache.
+"""Writes the tables of docs/objects.md from the manifests in assets/, and the contact sheets from the asset cache.
 
 python docs/build_objects.py             # tables, and contact sheets of what is prepared
 python docs/build_objects.py --check     # fail if a table is out of date
@@ -10,15 +10,16 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
-from tslam_bench.assets import contactdb, furniture, household, store
+from tslam_bench.assets import contactdb, furniture, generate, household, store
 from tslam_bench.assets.decompose import EXCEPTIONS, STANDARD, settings_for
 from tslam_bench.assets.pipeline import HULL_IOU_EXCEPTIONS
 from tslam_bench.files import atomic_file
@@ -26,7 +27,19 @@ from tslam_bench.files import atomic_file
 DOCS = Path(__file__).parent
 PAGE = DOCS / "objects.md"
 PICTURES = DOCS / "objects"
-MANIFEST = DOCS.parent / "assets" / "manifest_test.json"
+MANIFESTS = DOCS.parent / "assets"
+GATES = {
+    "hull IoU below 0.85": r"IoU\(hull union",
+    "more than one part": r"largest part",
+    "flat as a sheet": r"flat as a sheet",
+    "copy of a test object": r"a copy of test object",
+    "copy of another object of train or val": r"a copy of (train|val)/",
+}
+"""What a rejection is called in the table -> pattern of its reason."""
+
+
+Manifests = dict[str, dict[str, Any]]
+"""Split -> its manifest."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +58,9 @@ def table(heading: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
 
 
-def objects_table(records: list[dict[str, Any]]) -> str:
+def objects_table(manifests: Manifests) -> str:
     """Every test object with its gate figures."""
+    records = manifests["test"]["objects"]
     rows = [
         [
             f"`{r['name']}`",
@@ -78,13 +92,14 @@ def objects_table(records: list[dict[str, Any]]) -> str:
     return table([*heading, "hull IoU", "field error (mm)"], rows)
 
 
-def excluded_table(records: list[dict[str, Any]]) -> str:
+def excluded_table(manifests: Manifests) -> str:
     """Names of the paper's list that the split leaves out."""
     return table(["name", "why"], [[f"`{name}`", why] for name, why in contactdb.EXCLUDED.items()])
 
 
-def filled_table(records: list[dict[str, Any]]) -> str:
+def filled_table(manifests: Manifests) -> str:
     """Objects with voids that are filled."""
+    records = manifests["test"]["objects"]
     return table(
         ["name", "volume filled (cm3)", "volume with it (cm3)"],
         [
@@ -95,8 +110,9 @@ def filled_table(records: list[dict[str, Any]]) -> str:
     )
 
 
-def thin_table(records: list[dict[str, Any]]) -> str:
+def thin_table(manifests: Manifests) -> str:
     """Objects with settings of their own."""
+    records = manifests["test"]["objects"]
     rows = []
     for r in records:
         settings = settings_for("test", r["name"])
@@ -114,8 +130,9 @@ def thin_table(records: list[dict[str, Any]]) -> str:
     return table(["name", "concavity threshold", "most hulls", "hulls", "hull IoU"], rows)
 
 
-def gates_table(records: list[dict[str, Any]]) -> str:
+def gates_table(manifests: Manifests) -> str:
     """What the gates say about the test split as a whole."""
+    records = manifests["test"]["objects"]
     iou = np.array([r["gates"]["hull_iou"] for r in records])
     hulls = np.array([r["hull_count"] for r in records])
     repaired = [r for r in records if r["repair"] != "kept"]
@@ -135,8 +152,9 @@ def gates_table(records: list[dict[str, Any]]) -> str:
     return table(["", "test split"], rows)
 
 
-def exceptions_table(records: list[dict[str, Any]]) -> str:
+def exceptions_table(manifests: Manifests) -> str:
     """Objects below the gate, with the reason why they are in."""
+    records = manifests["test"]["objects"]
     rows = [
         [f"`{r['name']}`", f"{r['gates']['hull_iou']:.3f}", HULL_IOU_EXCEPTIONS[f"test/{r['name']}"]]
         for r in records
@@ -145,82 +163,188 @@ def exceptions_table(records: list[dict[str, Any]]) -> str:
     return table(["name", "hull IoU", "reason"], rows) if rows else "None."
 
 
-def license_table(records: list[dict[str, Any]]) -> str:
+def license_table(manifests: Manifests) -> str:
     """Where the objects come from and under which licences."""
-    rows = [["test", contactdb.SOURCE, contactdb.LICENSE]]
-    rows += [
-        ["train, val", f"Sweet Home 3D furniture 1.8, catalogue {name}", text]
-        for name, text in furniture.LICENSES.items()
-    ]
-    rows += [["train, val", "generated", "Apache-2.0"]]
-    return table(["split", "source", "licence"], rows)
+    rows = [["test", contactdb.SOURCE, contactdb.LICENSE, "", len(manifests["test"]["objects"])]]
+    for split in ("train", "val"):
+        records = manifests[split]["objects"]
+        for name, text in furniture.LICENSES.items():
+            of_catalogue = [r for r in records if f": {name}: " in r["source"]]
+            creators = {r["details"]["creator"] for r in of_catalogue}
+            rows.append(
+                [split, f"Sweet Home 3D furniture 1.8, catalogue {name}", text, len(creators), len(of_catalogue)]
+            )
+        generated = [r for r in records if _is_generated(r)]
+        rows.append([split, "generated", "Apache-2.0", "", len(generated)])
+    return table(["split", "source", "licence", "creators", "objects"], rows)
 
 
-def categories_table(records: list[dict[str, Any]]) -> str:
-    """Categories of the generator and of the furniture package."""
-    generated: dict[str, list[str]] = {"train": [], "val": []}
-    for kind in household.CATEGORIES.values():
-        generated[kind.split].append(kind.name)
-    real: dict[str, list[str]] = {"train": [], "val": []}
-    for category in furniture.categories():
-        real["val" if category in furniture.VAL_CATEGORIES else "train"].append(category)
+def creators_table(manifests: Manifests) -> str:
+    """Who made the furniture models, by licence."""
+    count: dict[str, Counter[str]] = {}
+    for record in (r for split in ("train", "val") for r in manifests[split]["objects"] if not _is_generated(r)):
+        count.setdefault(record["license"], Counter())[record["details"]["creator"] or "(not named)"] += 1
     rows = [
-        [split, source, len(names), ", ".join(names)]
-        for split in ("train", "val")
-        for source, names in (("generated", generated[split]), ("furniture", real[split]))
+        [text, ", ".join(f"{name} ({number})" if number > 1 else name for name, number in sorted(creators.items()))]
+        for text, creators in sorted(count.items())
     ]
-    return table(["split", "source", "categories", ""], rows)
+    return table(["licence", "creators (number of objects in train and val, if more than one)"], rows)
 
 
-SECTIONS: dict[str, Callable[[list[dict[str, Any]]], str]] = {
+def _is_generated(record: dict[str, Any]) -> bool:
+    return bool(record["source"].startswith("generated"))
+
+
+def categories_table(manifests: Manifests) -> str:
+    """Objects per category and source."""
+    rows = []
+    for split in ("train", "val"):
+        real, drawn = (
+            Counter(r["category"] for r in manifests[split]["objects"] if _is_generated(r) == generated)
+            for generated in (False, True)
+        )
+        rows += [
+            [split, name, real[name] or "", drawn[name] or "", real[name] + drawn[name]]
+            for name in sorted(real | drawn)
+        ]
+        names = f"**{len(real | drawn)} categories**"
+        rows.append([split, names, real.total(), drawn.total(), real.total() + drawn.total()])
+    return table(["split", "category", "furniture", "generated", "objects"], rows)
+
+
+def training_gates_table(manifests: Manifests) -> str:
+    """What the gates say about train and val."""
+    columns = []
+    splits = [split for split in ("train", "val") if manifests[split]["objects"]]
+    for split in splits:
+        records = manifests[split]["objects"]
+        iou = np.array([r["gates"]["hull_iou"] for r in records])
+        hulls = np.array([r["hull_count"] for r in records])
+        closest = max(records, key=lambda r: r["gates"]["closest_test_overlap"])
+        repair = Counter(r["repair"] for r in records)
+        columns.append(
+            [
+                len(records),
+                len({r["category"] for r in records}),
+                ", ".join(f"{value:.3f}" for value in np.quantile(iou, [0, 0.05, 0.5, 0.95])),
+                ", ".join(f"{value:.0f}" for value in np.quantile(hulls, [0.05, 0.5, 0.95, 1])),
+                f"{1e3 * max(r['gates']['field_error_m'] for r in records):.2f} mm",
+                ", ".join(str(repair[name]) for name in ("ball", "kept", "winding")),
+                sum(r["differs_from_raw"] for r in records),
+                f"{closest['gates']['closest_test_overlap']:.3f}"
+                f" ({closest['name']}, {closest['gates']['closest_test_object']})",
+                f"{sum(r['bytes'] for r in records) / 1e6:.0f} MB",
+            ]
+        )
+    names = [
+        "objects",
+        "categories",
+        "hull IoU: lowest, 5 %, median, 95 %",
+        "hulls per object: 5 %, median, 95 %, most",
+        "largest field error at the surface",
+        "repair: rebuilt by the ball, kept as it is, rebuilt by winding numbers",
+        "objects with filled voids",
+        "largest overlap with a test object",
+        "on disk",
+    ]
+    return table(["", *splits], [list(row) for row in zip(names, *columns, strict=True)])
+
+
+def rejections_table(manifests: Manifests) -> str:
+    """How many objects each gate rejected."""
+    rows = []
+    for split in ("train", "val"):
+        generated = {source.name for source in generate.candidates(split, rounds=200)}
+        for gate, pattern in GATES.items():
+            names = [n for n, reason in manifests[split]["rejected"].items() if re.search(pattern, reason)]
+            drawn = sum(name in generated for name in names)
+            rows.append([split, gate, len(names) - drawn or "", drawn or ""])
+    return table(["split", "gate", "furniture", "generated"], rows)
+
+
+def copies_table(manifests: Manifests) -> str:
+    """Objects that repeat another one of train or val."""
+    rows = []
+    for split in ("train", "val"):
+        for name, reason in manifests[split]["rejected"].items():
+            match = re.search(r"a copy of ((?:train|val)/\S+) \(aligned IoU ([0-9.]+)\)", reason)
+            if match:
+                rows.append([f"`{split}/{name}`", f"`{match[1]}`", match[2]])
+    return table(["dropped", "copy of", "aligned IoU"], rows) if rows else "None."
+
+
+SECTIONS: dict[str, Callable[[Manifests], str]] = {
     "objects": objects_table,
     "excluded": excluded_table,
     "filled": filled_table,
     "thin": thin_table,
     "gates": gates_table,
     "exceptions": exceptions_table,
-    "licenses": license_table,
     "categories": categories_table,
+    "training_gates": training_gates_table,
+    "rejections": rejections_table,
+    "copies": copies_table,
+    "licenses": license_table,
+    "creators": creators_table,
 }
 
 
-def fill(text: str, records: list[dict[str, Any]]) -> str:
+def read_manifest(split: str) -> dict[str, Any]:
+    """The reference manifest of a split; an empty one where there is none yet."""
+    path = MANIFESTS / f"manifest_{split}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"objects": [], "rejected": {}}
+
+
+def fill(text: str, manifests: Manifests) -> str:
     """The page with every table between its markers renewed."""
     for name, make in SECTIONS.items():
         pattern = re.compile(rf"(<!-- {name}: written by docs/build_objects.py -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(text):
             raise SystemExit(f"{PAGE}: no place for table {name!r}")
-        table_text = make(records)
+        table_text = make(manifests)
         text = pattern.sub(lambda match, body=table_text: f"{match[1]}{body}\n{match[2]}", text)
     return text
 
 
+def _prepared_panels(split: str, names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.float64], NDArray[np.int64]]]:
+    """(caption, vertices, faces) of prepared objects."""
+    for name in names:
+        short = re.sub(r"-(blendswap-cc-0|blendswap-cc-by|katorlegaz|scopia)-\d+$", "", name)
+        yield short[:18], *store.load_surface(name, split)
+
+
+def _one_of_each(split: str) -> list[str]:
+    """The first object of each category of each source, by category."""
+    first: dict[tuple[str, bool], str] = {}
+    for record in store.list_objects(split):
+        first.setdefault((record["category"], _is_generated(record)), record["name"])
+    return [name for _, name in sorted(first.items())]
+
+
 def draw_sheets() -> None:
     """Contact sheets of the prepared objects of each split, and of the generator."""
-    from tslam_bench.assets import generate
     from tslam_bench.assets.pictures import contact_sheet
 
     PICTURES.mkdir(exist_ok=True)
-    for split in store.SPLITS:
-        names = store.prepared_names(split)
-        if len(names) < 40:
-            continue
-        loaded = (store.load_object(name, split) for name in names[:: max(1, len(names) // 120)][:120])
-        sheet = contact_sheet((o.name[:22], o.vertices, o.faces) for o in loaded)
-        sheet.quantize(64).save(PICTURES / f"{split}.png", optimize=True)
-        print(
-            PICTURES / f"{split}.png",
-            Counter(store.read_record(name, split)["category"] for name in names).most_common(5),
-        )
-    shapes = ((f"{kind}-{k:03d}", *generate.draw(kind, k)[0]) for kind in household.CATEGORIES for k in range(3))
-    contact_sheet(shapes, columns=12, size=110).quantize(64).save(PICTURES / "generated.png", optimize=True)
+    chosen = {split: store.prepared_names(split) for split in store.SPLITS}
+    chosen["train"] = _one_of_each("train")
+    sheets = {
+        split: (_prepared_panels(split, names), 10 if split == "test" else 12)
+        for split, names in chosen.items()
+        if names
+    }
+    kinds = ((f"{kind} {k}", *generate.draw(kind, k)[0]) for kind in household.CATEGORIES for k in range(2))
+    for name, (panels, columns) in {**sheets, "generated": (kinds, 12)}.items():
+        path = PICTURES / f"{name}.png"
+        contact_sheet(panels, columns, 150 if name == "test" else 100).quantize(48).save(path, optimize=True)
+        print(path, f"{path.stat().st_size / 1e3:.0f} kB")
 
 
 def main(config: Config) -> None:
     """Writes or checks the page."""
-    records = json.loads(MANIFEST.read_text(encoding="utf-8"))["objects"]
+    manifests = {split: read_manifest(split) for split in store.SPLITS}
     old = PAGE.read_text(encoding="utf-8")
-    new = fill(old, records)
+    new = fill(old, manifests)
     if config.check:
         sys.exit(f"{PAGE} is out of date; run python docs/build_objects.py" if old != new else 0)
     with atomic_file(PAGE) as temporary:

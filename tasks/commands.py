@@ -141,10 +141,14 @@ def observation_rows(environment: Any) -> list[dict[str, Any]]:
 
 
 def _print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
-    table = Table(*rows[0], title=title)
+    table = Table(title=title)
+    for index, heading in enumerate(rows[0]):
+        table.add_column(heading, no_wrap=index == 0)  # a name must not be cut
     for row in rows:
         table.add_row(*(str(value) for value in row.values()))
-    Console().print(table)
+    console = Console()
+    console = Console(width=max(console.width, 100))  # a pipe has no width
+    console.print(table)
 
 
 def _list(command: List) -> None:

@@ -259,7 +259,7 @@ def _prepare_hand(again: bool) -> None:
 
 def _prepare(command: Prepare) -> None:
     from tslam_bench.assets.furniture import write_attributions
-    from tslam_bench.assets.prepare import write_manifest
+    from tslam_bench.assets.prepare import remove_unlisted, write_manifest
 
     if command.hand:
         _prepare_hand(again=True)
@@ -270,6 +270,9 @@ def _prepare(command: Prepare) -> None:
     if split == "test":
         _prepare_hand(again=False)
     else:
+        if command.manifest is not None and not command.objects:
+            for name in remove_unlisted(split, (source.name for source in items)):
+                print(f"{name}: no longer in {command.manifest}, removed from the cache")
         write_attributions(store.list_objects(split), cache_directory() / f"attributions-{split}.json")
         _renew_val_manifest(split)
     path = write_manifest(split)

@@ -16,7 +16,7 @@ from tslam_bench.assets import contactdb, sources, store
 from tslam_bench.assets.fetch import fetch
 from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import PROTOCOL_VERSION
-from tslam_bench.errors import BenchmarkError
+from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, ensure_writable_directory, remove_directory, write_json
 
 MANIFEST_VERSION = 1
@@ -234,6 +234,23 @@ def drop_copies(items: Sequence[Any], cache: Path | None = None) -> list[Outcome
         rejections.add_record(store.read_record(copy.copy[1], copy.copy[0], cache), copy.reason)
         remove_directory(store.object_directory(copy.copy[1], copy.copy[0], cache))
     return [Outcome(copy.copy[1], "rejected", copy.reason, None) for copy in copies if copy.copy[0] == split]
+
+
+def remove_unlisted(split: str, names: Iterable[str], cache: Path | None = None) -> list[str]:
+    """Removes the prepared objects of an organiser's split that its manifest no longer lists; returns their names.
+
+    The whole split counts in the tasks, so what has left the manifest has to leave the cache as well.
+
+    Raises:
+        InvalidInputError: ``split`` is one of the benchmark's own.
+    """
+    if split in store.SPLITS:
+        raise InvalidInputError(f"split {split!r}: is not an organiser's own")
+    cache = cache or cache_directory()
+    gone = sorted(set(store.prepared_names(split, cache)) - set(names))
+    for name in gone:
+        remove_directory(store.object_directory(name, split, cache))
+    return gone
 
 
 def _prepare_shared(item: Any, cache: Path) -> None:

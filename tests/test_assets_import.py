@@ -20,6 +20,7 @@ from tslam_bench.assets import commands, generate, meshfiles, store
 from tslam_bench.assets.hand import hand_directory, load_hand
 from tslam_bench.assets.importer import read_set, scan
 from tslam_bench.assets.meshfiles import read_mesh_file
+from tslam_bench.assets.prepare import remove_unlisted
 from tslam_bench.assets.scaling import LONGEST_EDGE, scale_to_hand
 from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
@@ -435,7 +436,19 @@ def test_a_private_set_from_files_to_touch(tmp_path, monkeypatch, capsys):
         gym.make(ENVIRONMENT_ID, split="mine", object="mug").reset(seed=0)
     with pytest.raises(InvalidInputError, match="yours"):
         gym.make(ENVIRONMENT_ID, split="yours").reset(seed=0)
+
+    manifest.write_text(json.dumps({"split": "mine", "license": "ours", "source": "lab", "objects": entries[:1]}))
     capsys.readouterr()
+    commands.main(["prepare", "--manifest", str(manifest), "--objects", "carton", "--workers", "1"])
+    assert store.prepared_names("mine") == ["bracket", "carton"]  # a part of the manifest removes nothing
+    commands.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
+    assert store.prepared_names("mine") == ["carton"]
+    assert "bracket: no longer in" in capsys.readouterr().out
+
+
+def test_the_splits_of_the_benchmark_lose_nothing_to_a_manifest():
+    with pytest.raises(InvalidInputError, match="'train'"):
+        remove_unlisted("train", [])
 
 
 def misbehave(how: str) -> str:

@@ -151,7 +151,11 @@ def _interpolation_matrix(
     corners = np.array(list(np.ndindex(2, 2, 2)))
     weights = np.where(corners[None] == 1, fraction[:, None], 1 - fraction[:, None]).prod(axis=2)
     flat = np.ravel_multi_index(tuple((lower[:, None] + corners[None]).transpose(2, 0, 1)), shape)
-    used, column = np.unique(flat, return_inverse=True)
+    column_of = np.zeros(np.prod(shape), dtype=np.int64)
+    column_of[flat] = 1
+    used = np.flatnonzero(column_of)
+    column_of[used] = np.arange(len(used))
+    column = column_of[flat]
     row = np.repeat(np.arange(len(points)), 8)
     matrix = sparse.csr_matrix((weights.ravel(), (row, column.ravel())), (len(points), len(used)))
     return matrix, used

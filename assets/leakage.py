@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from tslam_bench.assets import contactdb
-from tslam_bench.assets.distance import contains
+from tslam_bench.assets.distance import InsideTest, contains
 from tslam_bench.assets.meshes import TriangleMesh, from_manifold, parse_stl
 from tslam_bench.assets.scanline import inside_grid
 from tslam_bench.errors import AssetError
@@ -70,10 +70,11 @@ def normalise(name: str, mesh: TriangleMesh) -> Shape:
     normalised = TriangleMesh((mesh.vertices - centre) / radius, mesh.faces)
     generator = np.random.default_rng(_SEED)
     low, high = normalised.bounds
+    inside = InsideTest(normalised)
     found: list[NDArray[np.float64]] = []
     for _ in range(100):
         batch = generator.uniform(low, high, (20_000, 3))
-        found.append(batch[contains(batch, normalised)])
+        found.append(batch[inside(batch)])
         if sum(map(len, found)) >= _POINTS:
             break
     else:

@@ -226,6 +226,6 @@ def _repair_error(original: TriangleMesh, repaired: TriangleMesh) -> float:
     """
     points, face = sample_surface(original, 20_000, np.random.default_rng(_SEED))
     offset = 1e-4 * original.face_normals()[face]
-    outside, inside = winding_numbers(points + offset, original), winding_numbers(points - offset, original)
+    outside, inside = np.split(winding_numbers(np.concatenate([points + offset, points - offset]), original), 2)
     on_surface = np.abs(inside - outside) > 0.5
     return float(np.quantile(distance_to_mesh(points[on_surface], repaired), 0.99)) if on_surface.any() else 0.0

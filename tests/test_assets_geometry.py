@@ -6,7 +6,7 @@ import trimesh
 from manifold3d import Manifold
 
 from tslam_bench.assets import generate
-from tslam_bench.assets.distance import contains, distance_to_mesh, sample_surface
+from tslam_bench.assets.distance import InsideTest, contains, distance_to_mesh, sample_surface
 from tslam_bench.assets.meshes import TriangleMesh, from_manifold, is_valid, parse_stl, simplify, to_manifold
 from tslam_bench.assets.scanline import inside_grid
 from tslam_bench.errors import AssetError
@@ -79,3 +79,12 @@ def test_parse_stl_refuses_what_is_no_mesh(data):
     with pytest.raises(AssetError) as caught:
         parse_stl(data)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("category", ["mug", "fork", "whisk"])
+def test_inside_tests_by_cells_answer_like_winding_numbers(category):
+    mesh = generate.draw(category, 0)[0]
+    points = np.random.default_rng(3).uniform(*mesh.bounds, (4_000, 3))
+    inside = contains(points, mesh)
+    assert 0 < inside.mean() < 0.9
+    np.testing.assert_array_equal(InsideTest(mesh)(points), inside)

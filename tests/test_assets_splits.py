@@ -1,8 +1,14 @@
 """Val holds out whole categories, by meaning and in both sources; the committed manifests keep what the protocol promises."""
 
+import json
 import re
+from pathlib import Path
 
-from tslam_bench.assets import furniture, household
+import pytest
+
+from tslam_bench.assets import contactdb, furniture, generate, household, store
+from tslam_bench.assets.leakage import MAX_OVERLAP
+from tslam_bench.assets.pipeline import MIN_HULL_IOU
 
 KIN = {
     "anchor": r"anchor",
@@ -54,3 +60,31 @@ def test_every_category_of_val_has_its_words():
 def test_no_category_is_in_both_splits():
     assert not held_out("train") & held_out("val")
     assert {name: words_of_val(name) for name in held_out("train") if words_of_val(name)} == {}
+
+
+@pytest.mark.parametrize(("split", "least", "least_categories"), [("train", 600, 50), ("val", 60, 10)])
+def test_the_default_sets_keep_what_the_protocol_promises(split, least, least_categories):
+    """What was prepared from an empty cache and committed: size, gates, leakage, licences, meaning."""
+    path = Path(store.__file__).parent / f"manifest_{split}.json"
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    objects = {record["name"]: record for record in manifest["objects"]}
+    categories = {record["category"] for record in objects.values()}
+    assert manifest["split"] == split
+    assert len(objects) == len(manifest["objects"]) >= least
+    assert least_categories <= len(categories)
+    assert categories <= held_out(split)
+    assert not set(objects) & set(manifest["rejected"])
+    licences = {"Apache-2.0", *furniture.LICENSES.values()}
+    for record in objects.values():
+        gates = record["gates"]
+        assert gates["hull_iou"] >= MIN_HULL_IOU
+        assert gates["closest_test_overlap"] <= MAX_OVERLAP
+        assert gates["closest_test_object"] in {"", *contactdb.OBJECTS}
+        assert record["license"] in licences
+        assert len(record["products_sha256"]) == 64
+        assert 0.03 <= max(record["extents_m"]) <= 0.25
+    generated = {source.name for source in generate.candidates(split, rounds=200)}
+    titles = {record["details"].get("title", record["category"]) for record in objects.values()}
+    assert {name for name in objects if "title" not in objects[name]["details"]} <= generated
+    if split == "train":
+        assert {title: words_of_val(title) for title in titles if words_of_val(title)} == {}

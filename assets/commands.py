@@ -158,6 +158,7 @@ def _check_workers(workers: int, time_limit: float) -> None:
 
 def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
     """Split, what to prepare of it, and how many of that (None: all)."""
+    from tslam_bench.assets.decompose import settings_for
     from tslam_bench.assets.prepare import ContactDBSource
 
     _check_workers(command.workers, command.time_limit)
@@ -181,7 +182,9 @@ def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
             raise InvalidInputError("--source, --count: the test split is fixed; --objects NAME ... takes a part of it")
         names = command.objects or (QUICK_OBJECTS if command.quick else tuple(contactdb.OBJECTS))
         resolved = dict.fromkeys(store.resolve_name(name, "test") for name in names)
-        return split, [ContactDBSource(name) for name in resolved], None
+        # Those that take longest go first, so that no worker is left alone with one in the end.
+        longest_first = sorted(resolved, key=lambda name: -settings_for("test", name).max_hulls)
+        return split, [ContactDBSource(name) for name in longest_first], None
     generated, real = _training_sources(command, split)
     if command.objects:
         by_name = {source.name: source for source in [*generated, *real]}

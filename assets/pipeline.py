@@ -35,6 +35,8 @@ LEAKAGE_SPLITS = ("train", "val")
 """Splits that no copy of a test object may enter."""
 MIN_KEPT_SHARE = 0.95
 """Gate outside the test split: the largest connected part holds at least this share of the volume."""
+MIN_KEPT_EXTENT = 0.8
+"""Gate outside the test split: longest edge after repair by that of the source; less means that a part was lost as a sheet."""
 MIN_THICKNESS = 0.02
 """Gate outside the test split: shortest by longest edge of the bounding box; less is a sheet."""
 MIN_EXTENT = 5e-3
@@ -123,7 +125,7 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
         ground_truth = from_manifold(filled.solid)
         closest = None
         if item.split != "test":  # the test split is given; elsewhere another object takes the place of a bad one
-            check_gates(ground_truth, repaired.kept_share)
+            check_gates(ground_truth, repaired.kept_share, float(item.mesh.extents.max()))
         if item.split in LEAKAGE_SPLITS:
             closest = leakage.closest(ground_truth, leakage.references(fetch(CONTACTDB_WHEEL, cache), cache))
             if closest.is_copy:
@@ -208,11 +210,22 @@ def check_size(mesh: TriangleMesh) -> None:
         )
 
 
-def check_gates(ground_truth: TriangleMesh, kept_share: float) -> None:
-    """Raises GateError for a repaired mesh that is in parts, flat, or larger than the workspace."""
+def check_gates(ground_truth: TriangleMesh, kept_share: float, longest_edge: float) -> None:
+    """Raises GateError for a repaired mesh that is in parts, lost some, is flat, or larger than the workspace.
+
+    Args:
+        ground_truth: the repaired mesh.
+        kept_share: volume of its largest part by that of all parts.
+        longest_edge: longest edge (m) of the source mesh's bounding box.
+    """
     if kept_share < MIN_KEPT_SHARE:
         raise GateError(f"gate: the largest part holds only {kept_share:.0%} of the volume")
     extents = ground_truth.extents
+    if extents.max() < MIN_KEPT_EXTENT * longest_edge:
+        share = extents.max() / longest_edge
+        raise GateError(
+            f"gate: repair keeps only {share:.0%} of the longest edge (open sheets or loose parts were lost)"
+        )
     if extents.min() < MIN_THICKNESS * extents.max():
         raise GateError("gate: flat as a sheet")
     if not MIN_EXTENT <= extents.max() <= WORKSPACE_EDGE:

@@ -31,12 +31,15 @@ MANIFESTS = DOCS.parent / "assets"
 GATES = {
     "hull IoU below 0.85": r"IoU\(hull union",
     "more than one part": r"largest part",
+    "a part lost in repair": r"of the longest edge",
     "flat as a sheet": r"flat as a sheet",
     "copy of a test object": r"a copy of test object",
     "copy of another object of train or val": r"a copy of (train|val)/",
 }
 """What a rejection is called in the table -> pattern of its reason."""
 
+CAPTION = 15
+"""Characters of a caption that fit under a panel."""
 
 Manifests = dict[str, dict[str, Any]]
 """Split -> its manifest."""
@@ -309,8 +312,8 @@ def fill(text: str, manifests: Manifests) -> str:
 def _prepared_panels(split: str, names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.float64], NDArray[np.int64]]]:
     """(caption, vertices, faces) of prepared objects."""
     for name in names:
-        short = re.sub(r"-(blendswap-cc-0|blendswap-cc-by|katorlegaz|scopia)-\d+$", "", name)
-        yield short[:18], *store.load_surface(name, split)
+        short = re.sub(r"-(?:(?:blendswap-cc-0|blendswap-cc-by|katorlegaz|scopia)-)?\d+$", "", name)
+        yield short[:CAPTION], *store.load_surface(name, split)
 
 
 def _one_of_each(split: str) -> list[str]:
@@ -333,7 +336,9 @@ def draw_sheets() -> None:
         for split, names in chosen.items()
         if names
     }
-    kinds = ((f"{kind} {k}", *generate.draw(kind, k)[0]) for kind in household.CATEGORIES for k in range(2))
+    kinds = (
+        (f"{kind[: CAPTION - 2]} {k}", *generate.draw(kind, k)[0]) for kind in household.CATEGORIES for k in range(2)
+    )
     for name, (panels, columns) in {**sheets, "generated": (kinds, 12)}.items():
         path = PICTURES / f"{name}.png"
         contact_sheet(panels, columns, 150 if name == "test" else 100).quantize(48).save(path, optimize=True)

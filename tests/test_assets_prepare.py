@@ -8,12 +8,13 @@ import zipfile
 
 import numpy as np
 import pytest
+import trimesh
 
-from tslam_bench.assets import commands, contactdb, generate, prepare, store
+from tslam_bench.assets import commands, contactdb, generate, prepare, repair, store
 from tslam_bench.assets.distance import contains
 from tslam_bench.assets.fetch import fetch
-from tslam_bench.assets.meshes import TriangleMesh
-from tslam_bench.assets.pipeline import check_size
+from tslam_bench.assets.meshes import TriangleMesh, from_manifold
+from tslam_bench.assets.pipeline import GateError, check_gates, check_size
 from tslam_bench.assets.sources import CONTACTDB_WHEEL
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
@@ -125,6 +126,24 @@ def test_sizes_that_cannot_be_metres():
     with pytest.raises(AssetError, match="finite"):
         check_size(TriangleMesh(cube * np.nan, faces))
     check_size(TriangleMesh(0.1 * cube, faces))
+
+
+def test_a_mesh_that_loses_a_sheet_in_repair_is_rejected():
+    """A rod with a banner of no thickness, drawn from both sides: the banner cancels out, and what is left is another thing."""
+    rod = trimesh.creation.box([0.03, 0.02, 0.02])
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0, 0.02], [0, 0, 0.02]])
+    banner = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
+    mesh = TriangleMesh(
+        np.concatenate([rod.vertices, corners]), np.concatenate([rod.faces, banner + len(rod.vertices)])
+    )
+    longest = float(mesh.extents.max())
+    repaired = repair.repair(mesh)
+    solid = from_manifold(repaired.solid)
+    assert longest == pytest.approx(0.215)
+    assert solid.extents.max() == pytest.approx(0.03)
+    with pytest.raises(GateError, match=r"keeps only 14% of the longest edge"):
+        check_gates(solid, repaired.kept_share, longest)
+    check_gates(solid, repaired.kept_share, 0.03)
 
 
 def test_the_contactdb_table():

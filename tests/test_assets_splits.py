@@ -62,7 +62,7 @@ def test_no_category_is_in_both_splits():
     assert {name: words_of_val(name) for name in held_out("train") if words_of_val(name)} == {}
 
 
-@pytest.mark.parametrize(("split", "least", "least_categories"), [("train", 600, 50)])
+@pytest.mark.parametrize(("split", "least", "least_categories"), [("train", 600, 50), ("val", 60, 10)])
 def test_the_default_sets_keep_what_the_protocol_promises(split, least, least_categories):
     """What was prepared from an empty cache and committed: size, gates, leakage, licences, meaning."""
     path = Path(store.__file__).parent / f"manifest_{split}.json"

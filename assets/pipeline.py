@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tslam_bench.assets import decompose, field, leakage, occupancy, repair, store, voids
 from tslam_bench.assets.distance import distance_to_mesh, sample_surface, winding_numbers
@@ -35,8 +36,8 @@ LEAKAGE_SPLITS = ("train", "val")
 """Splits that no copy of a test object may enter."""
 MIN_KEPT_SHARE = 0.95
 """Gate outside the test split: the largest connected part holds at least this share of the volume."""
-MIN_KEPT_EXTENT = 0.8
-"""Gate outside the test split: longest edge after repair by that of the source; less means that a part was lost as a sheet."""
+MAX_LOST_EXTENT = 0.2
+"""Gate outside the test split: most that repair may take from an edge of the bounding box, by the longest edge."""
 MIN_THICKNESS = 0.02
 """Gate outside the test split: shortest by longest edge of the bounding box; less is a sheet."""
 MIN_EXTENT = 5e-3
@@ -125,7 +126,7 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
         ground_truth = from_manifold(filled.solid)
         closest = None
         if item.split != "test":  # the test split is given; elsewhere another object takes the place of a bad one
-            check_gates(ground_truth, repaired.kept_share, float(item.mesh.extents.max()))
+            check_gates(ground_truth, repaired.kept_share, item.mesh.extents)
         if item.split in LEAKAGE_SPLITS:
             closest = leakage.closest(ground_truth, leakage.references(fetch(CONTACTDB_WHEEL, cache), cache))
             if closest.is_copy:
@@ -210,21 +211,21 @@ def check_size(mesh: TriangleMesh) -> None:
         )
 
 
-def check_gates(ground_truth: TriangleMesh, kept_share: float, longest_edge: float) -> None:
+def check_gates(ground_truth: TriangleMesh, kept_share: float, source_extents: NDArray[np.float64]) -> None:
     """Raises GateError for a repaired mesh that is in parts, lost some, is flat, or larger than the workspace.
 
     Args:
         ground_truth: the repaired mesh.
         kept_share: volume of its largest part by that of all parts.
-        longest_edge: longest edge (m) of the source mesh's bounding box.
+        source_extents: (3,) edges (m) of the source mesh's bounding box.
     """
     if kept_share < MIN_KEPT_SHARE:
         raise GateError(f"gate: the largest part holds only {kept_share:.0%} of the volume")
     extents = ground_truth.extents
-    if extents.max() < MIN_KEPT_EXTENT * longest_edge:
-        share = extents.max() / longest_edge
+    lost = float((source_extents - extents).max() / source_extents.max())
+    if lost > MAX_LOST_EXTENT:
         raise GateError(
-            f"gate: repair keeps only {share:.0%} of the longest edge (open sheets or loose parts were lost)"
+            f"gate: repair takes {lost:.0%} of the longest edge away (open sheets or loose parts were lost)"
         )
     if extents.min() < MIN_THICKNESS * extents.max():
         raise GateError("gate: flat as a sheet")

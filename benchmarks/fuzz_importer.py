@@ -116,7 +116,7 @@ def cheap_import(source: importer.ImportedSource, cache: Path) -> tuple[str, str
         check_size(item.mesh)
         repaired = repair.repair(item.mesh)
         solid = from_manifold(repaired.solid)
-        check_gates(solid, repaired.kept_share, float(item.mesh.extents.max()))
+        check_gates(solid, repaired.kept_share, item.mesh.extents)
     except AssetError as error:
         return "rejected", str(error)
     except Exception as error:

@@ -57,6 +57,8 @@ class Prepare:
     """Processes."""
     time_limit: float = 900.0
     """Seconds after which one object is given up."""
+    recheck: bool = False
+    """Try the objects again that were rejected before, here or when the default sets were made."""
     write_manifest: Path | None = None
     """Also write the split's manifest to this file (of train and val: one line per object)."""
 
@@ -222,14 +224,14 @@ def _all_known(names: tuple[str, ...], sources: list[Any]) -> bool:
 
 
 def _show_progress(
-    title: str, items: Sequence[Any], count: int | None, workers: int, time_limit: float
+    title: str, items: Sequence[Any], count: int | None, workers: int, time_limit: float, recheck: bool = False
 ) -> tuple[dict[str, int], list[Any]]:
     """Prepares with a progress bar and a line per object; returns how many of each status, and an outcome per object."""
     from tslam_bench.assets.prepare import prepare_distinct
 
     outcomes: dict[str, Any] = {}
     with tqdm(total=count or len(items), unit="object", desc=title, dynamic_ncols=True) as bar:
-        for outcome in prepare_distinct(items, count=count, workers=workers, time_limit=time_limit):
+        for outcome in prepare_distinct(items, count, workers=workers, time_limit=time_limit, recheck=recheck):
             dropped = outcome.name in outcomes
             outcomes[outcome.name] = outcome
             if dropped:
@@ -269,7 +271,9 @@ def _prepare(command: Prepare) -> None:
         return
     started = time.monotonic()
     split, items, count = _sources(command)
-    tally, outcomes = _show_progress(f"preparing {split}", items, count, command.workers, command.time_limit)
+    tally, outcomes = _show_progress(
+        f"preparing {split}", items, count, command.workers, command.time_limit, command.recheck
+    )
     if split == "test":
         _prepare_hand(again=False)
     else:

@@ -92,8 +92,8 @@ class Source(Protocol):
 
 
 def parameters_sha256(source: Source) -> str:
-    """Hash of everything that decides an object's products: source, pipeline version, settings, limits."""
-    parameters = {
+    """Hash of everything that decides an object's products and whether it is in: source, pipeline version, settings, gates."""
+    parameters: dict[str, Any] = {
         "pipeline": PIPELINE_VERSION,
         "format": store.FORMAT,
         "source": source.fingerprint(),
@@ -104,6 +104,8 @@ def parameters_sha256(source: Source) -> str:
         "leakage": [leakage.VERSION, leakage.MAX_OVERLAP] if source.split in LEAKAGE_SPLITS else None,
         "field": [field.PADDING, SIGNED_DISTANCE_TOLERANCE],
     }
+    if source.split != "test":  # no gate keeps an object out of the test split
+        parameters["gates"] = [MIN_HULL_IOU, MIN_KEPT_SHARE, MAX_LOST_EXTENT, MIN_THICKNESS]
     return hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()
 
 

@@ -14,12 +14,13 @@ from typing import Any, Literal
 
 from tslam_bench.assets import contactdb, sources, store
 from tslam_bench.assets.fetch import fetch
+from tslam_bench.assets.rejections import Rejections
 from tslam_bench.assets.workers import WorkerPool
 from tslam_bench.constants import PROTOCOL_VERSION
 from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, ensure_writable_directory, remove_directory, write_json
 
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
 """Version of the manifest's layout."""
 TIME_LIMIT = 900.0
 """Seconds after which an object is given up."""
@@ -112,11 +113,12 @@ def prepare(
     cache: Path | None = None,
     workers: int = 2,
     time_limit: float = TIME_LIMIT,
+    recheck: bool = False,
 ) -> Iterator[Outcome]:
     """Prepares objects, skipping those that are intact; yields each object's outcome as it is known.
 
-    Can be interrupted at any time: every object is written as a whole or not at all. Objects that a gate rejected are
-    remembered with their parameters and not tried again.
+    Can be interrupted at any time: every object is written as a whole or not at all. Objects that a gate rejected, here or
+    when the reference manifests were made, are not tried again with the same parameters.
 
     Args:
         items: sources (see :class:`tslam_bench.assets.pipeline.Source`).
@@ -124,6 +126,7 @@ def prepare(
         cache: cache directory (default: the user's).
         workers: processes.
         time_limit: seconds after which one object is given up; it counts as failed.
+        recheck: try rejected objects again.
 
     Raises:
         AssetError: the cache cannot be written, or what all objects need cannot be fetched.
@@ -132,7 +135,7 @@ def prepare(
     _remove_stale(cache)
     queue = iter(items)
     wanted = count if count is not None else sys.maxsize
-    rejections = _Rejections(cache)
+    rejections = Rejections(cache)
     ready = 0
     shared = False
     pool: WorkerPool[tuple[Any, str], Outcome] = WorkerPool(_work, workers, time_limit)
@@ -146,7 +149,7 @@ def prepare(
                 if reason is None:
                     ready += 1
                     yield Outcome(item.name, "reused", "", store.read_record(item.name, item.split, cache))
-                elif (known := rejections.get(item)) is not None:
+                elif not recheck and (known := rejections.get(item)) is not None:
                     yield Outcome(item.name, "rejected", known, None)
                 else:
                     if not shared:
@@ -174,6 +177,7 @@ def prepare_distinct(
     cache: Path | None = None,
     workers: int = 2,
     time_limit: float = TIME_LIMIT,
+    recheck: bool = False,
 ) -> Iterator[Outcome]:
     """:func:`prepare`, and then drops what is a copy of another object of train or val.
 
@@ -189,7 +193,7 @@ def prepare_distinct(
     position = 0
     while True:
         wanted = None if count is None else count - len(kept)
-        for outcome in prepare(items[position:], wanted, cache, workers, time_limit):
+        for outcome in prepare(items[position:], wanted, cache, workers, time_limit, recheck):
             position += 1
             if outcome.record is not None:
                 kept.add(outcome.name)
@@ -229,9 +233,10 @@ def drop_copies(items: Sequence[Any], cache: Path | None = None) -> list[Outcome
         gone = {copy.copy for copy in copies}
         remaining = [key for key in train if key not in gone]
         copies += duplicates.find([("val", name) for name in prepared["val"]], remaining, cache, only_fixed=True)
-    rejections = _Rejections(cache)
+    rejections = Rejections(cache)
     for copy in copies:
-        rejections.add_record(store.read_record(copy.copy[1], copy.copy[0], cache), copy.reason)
+        record = store.read_record(copy.copy[1], copy.copy[0], cache)
+        rejections.add_copy(record, "/".join(copy.original), copy.reason)
         remove_directory(store.object_directory(copy.copy[1], copy.copy[0], cache))
     return [Outcome(copy.copy[1], "rejected", copy.reason, None) for copy in copies if copy.copy[0] == split]
 
@@ -272,54 +277,11 @@ def _remove_stale(cache: Path) -> None:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-class _Rejections:
-    """Objects that a gate rejected, by split, kept in ``<cache>/rejected-<split>.json``."""
-
-    def __init__(self, cache: Path) -> None:
-        self._cache = cache
-
-    def _path(self, split: str) -> Path:
-        return self._cache / f"rejected-{split}.json"
-
-    def _read(self, split: str) -> dict[str, dict[str, str]]:
-        try:
-            known = json.loads(self._path(split).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return known if isinstance(known, dict) else {}
-
-    def get(self, source: Any) -> str | None:
-        """Why ``source`` was rejected with its present parameters, or None."""
-        from tslam_bench.assets.pipeline import parameters_sha256
-
-        entry = self._read(source.split).get(source.name, {})
-        return entry["reason"] if entry.get("parameters_sha256") == parameters_sha256(source) else None
-
-    def reasons(self, split: str) -> dict[str, str]:
-        """Why each object of a split was rejected, by name, sorted."""
-        return {name: entry["reason"] for name, entry in sorted(self._read(split).items())}
-
-    def add(self, source: Any, reason: str) -> None:
-        """Remembers a rejection."""
-        from tslam_bench.assets.pipeline import parameters_sha256
-
-        self._write(source.split, source.name, parameters_sha256(source), reason)
-
-    def add_record(self, record: dict[str, Any], reason: str) -> None:
-        """Remembers the rejection of an object that was prepared."""
-        self._write(record["split"], record["name"], record["parameters_sha256"], reason)
-
-    def _write(self, split: str, name: str, parameters: str, reason: str) -> None:
-        entries = self._read(split)
-        entries[name] = {"parameters_sha256": parameters, "reason": reason}
-        write_json(self._path(split), entries)
-
-
 def write_manifest(split: str, path: Path | None = None, cache: Path | None = None) -> Path:
     """Writes the manifest of what is prepared of a split: ``<cache>/manifest-<split>.json`` unless ``path`` is given.
 
     A manifest that is written elsewhere is a reference to keep under version control. That of train and val is short: a line
-    per object with one hash over its products, and the reason of every rejection.
+    per object with one hash over its products, and every rejection with its reason.
     """
     cache = cache or cache_directory()
     records = store.list_objects(split, cache)
@@ -335,7 +297,7 @@ def write_manifest(split: str, path: Path | None = None, cache: Path | None = No
         return path
     lines = [json.dumps(_short(record), sort_keys=True, allow_nan=False) for record in records]
     names = {record["name"] for record in records}
-    rejected = {name: reason for name, reason in _Rejections(cache).reasons(split).items() if name not in names}
+    rejected = {name: entry for name, entry in Rejections(cache).entries(split).items() if name not in names}
     head = json.dumps(manifest | {"objects": [], "rejected": rejected}, indent=1, sort_keys=True, allow_nan=False)
     with atomic_file(path) as temporary:
         text = head.replace('"objects": []', '"objects": [\n' + ",\n".join(lines) + "\n ]", 1)

@@ -259,7 +259,7 @@ def rejections_table(manifests: Manifests) -> str:
     for split in ("train", "val"):
         generated = {source.name for source in generate.candidates(split, rounds=200)}
         for gate, pattern in GATES.items():
-            names = [n for n, reason in manifests[split]["rejected"].items() if re.search(pattern, reason)]
+            names = [n for n, entry in manifests[split]["rejected"].items() if re.search(pattern, entry["reason"])]
             drawn = sum(name in generated for name in names)
             rows.append([split, gate, len(names) - drawn or "", drawn or ""])
     return table(["split", "gate", "furniture", "generated"], rows)
@@ -269,10 +269,10 @@ def copies_table(manifests: Manifests) -> str:
     """Objects that repeat another one of train or val."""
     rows = []
     for split in ("train", "val"):
-        for name, reason in manifests[split]["rejected"].items():
-            match = re.search(r"a copy of ((?:train|val)/\S+) \(aligned IoU ([0-9.]+)\)", reason)
-            if match:
-                rows.append([f"`{split}/{name}`", f"`{match[1]}`", match[2]])
+        for name, entry in manifests[split]["rejected"].items():
+            match = re.search(r"\(aligned IoU ([0-9.]+)\)", entry["reason"])
+            if "original" in entry and match:
+                rows.append([f"`{split}/{name}`", f"`{entry['original']}`", match[1]])
     return table(["dropped", "copy of", "aligned IoU"], rows) if rows else "None."
 
 

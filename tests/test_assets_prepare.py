@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import zipfile
 
 import numpy as np
 import pytest
 import trimesh
 
-from tslam_bench.assets import commands, contactdb, generate, prepare, repair, store
+from tslam_bench.assets import commands, contactdb, generate, pipeline, prepare, repair, store
+from tslam_bench.assets import rejections as rejections_module
 from tslam_bench.assets.distance import contains
 from tslam_bench.assets.fetch import fetch
 from tslam_bench.assets.meshes import TriangleMesh, from_manifold
-from tslam_bench.assets.pipeline import GateError, check_gates, check_size
+from tslam_bench.assets.pipeline import GateError, check_gates, check_size, parameters_sha256
 from tslam_bench.assets.sources import CONTACTDB_WHEEL
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
@@ -213,3 +215,46 @@ def test_bad_input_is_one_line_and_status_2(cache, capsys, monkeypatch, argument
     assert status == 2
     assert len(err.strip().splitlines()) == 1
     assert all(word in err for word in words)
+
+
+def test_a_known_rejection_is_not_built_again_and_is_true(cache, tmp_path):
+    source = generate.GeneratedSource("train", "remote-control", 0)
+    known = list(prepare.prepare([source], cache=tmp_path, workers=1))
+    assert [outcome.status for outcome in known] == ["rejected"]
+    assert "a copy of test object phone" in known[0].message
+    assert [path.name for path in tmp_path.iterdir()] == [
+        "rejected-train.json"
+    ]  # not even the test objects were fetched
+    for part in ("downloads", "leakage"):
+        shutil.copytree(cache / part, tmp_path / part)
+    assert list(prepare.prepare([source], cache=tmp_path, workers=1, recheck=True)) == known
+
+
+def test_a_rejection_counts_only_for_the_same_parameters(tmp_path):
+    source = SpikySource()
+    entry = {"parameters_sha256": parameters_sha256(source), "reason": "train/spiky: gate: spiky"}
+    reference = tmp_path / "reference"
+    reference.mkdir()
+
+    def known(changes: dict[str, str], cache: str) -> str | None:
+        path = reference / "manifest_train.json"
+        path.write_text(json.dumps({"rejected": {"spiky": entry | changes}}))
+        rejections_module._reference_entries.cache_clear()
+        return rejections_module.Rejections(tmp_path / cache, reference).get(source)
+
+    assert known({}, "first") == entry["reason"]
+    assert known({"parameters_sha256": "0" * 64}, "second") is None
+    assert known({"parameters_sha256": "0" * 64}, "first") == entry["reason"]  # this cache has taken note
+    # That it repeats another object is for every cache to find out, as that depends on what else is there.
+    assert known({"original": "train/thorny"}, "third") is None
+    record = {"split": "train", "name": "spiky", "parameters_sha256": parameters_sha256(source)}
+    rejections_module.Rejections(tmp_path / "third", reference).add_copy(record, "train/thorny", "a copy")
+    assert known({"original": "train/thorny"}, "third") == "a copy"
+
+
+def test_gates_are_parameters_of_all_splits_but_test(monkeypatch):
+    train, test = SpikySource(), dataclasses.replace(SpikySource(), split="test")
+    before = parameters_sha256(train), parameters_sha256(test)
+    monkeypatch.setattr(pipeline, "MAX_LOST_EXTENT", 0.1)
+    assert parameters_sha256(train) != before[0]
+    assert parameters_sha256(test) == before[1]

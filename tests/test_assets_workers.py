@@ -1,4 +1,4 @@
-"""Preparing processes do not outlive the command that started them."""
+"""Preparing processes: their settings, and that they do not outlive the command that started them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from tslam_bench.assets.workers import WorkerPool
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
@@ -35,6 +37,22 @@ def test_workers_end_with_their_parent_in_the_middle_of_a_job(how):
     while any(_runs(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not any(_runs(pid) for pid in workers)
+
+
+def test_a_worker_has_settings_of_its_own(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
+    pool: WorkerPool[str, str | None] = WorkerPool(os.getenv, size=1, time_limit=60.0)
+    seen = {}
+    try:
+        for variable in ("OMP_NUM_THREADS", "MALLOC_TRIM_THRESHOLD_"):
+            pool.submit(variable, (variable,))
+            seen |= {item: result for item, result, _ in pool.results()}
+    finally:
+        pool.close()
+    assert seen == {"OMP_NUM_THREADS": "1", "MALLOC_TRIM_THRESHOLD_": str(2**32)}
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MALLOC_TRIM_THRESHOLD_" not in os.environ
 
 
 def _runs(pid: int) -> bool:

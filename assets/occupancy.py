@@ -1,15 +1,14 @@
-"""Ground-truth occupancy of a solid: voxels, surface samples, and the seeded points of the IoU (protocol sections 8 and 10)."""
+"""Ground-truth occupancy of a solid: voxels, surface samples, any points (protocol sections 8 and 10)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.assets.distance import contains, sample_surface
+from tslam_bench.assets.distance import InsideTest, contains, sample_surface
 from tslam_bench.assets.meshes import TriangleMesh
 from tslam_bench.constants import GRID_SIZE, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_LOW
 from tslam_bench.grids import voxel_centres
-from tslam_bench.sampling import iou_points
 
 SURFACE_SEED = 20211109
 """Seed of the surface samples: the same for every object."""
@@ -66,10 +65,9 @@ def surface_samples(mesh: TriangleMesh) -> tuple[NDArray[np.float64], NDArray[np
     return sample_surface(mesh, SURFACE_SAMPLES, np.random.Generator(np.random.PCG64(SURFACE_SEED)))
 
 
-def solid_at_iou_points(mesh: TriangleMesh) -> NDArray[np.bool_]:
-    """(100000,) bool: which of the seeded IoU points are inside the watertight mesh."""
-    points = iou_points()
+def solid_at(points: NDArray[np.float64], mesh: TriangleMesh) -> NDArray[np.bool_]:
+    """(N,) bool: which of ``points`` (N, 3) m are inside the watertight mesh."""
     low, high = mesh.bounds
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    inside[inside] = contains(points[inside], mesh)
+    inside[inside] = InsideTest(mesh)(points[inside])
     return inside

@@ -21,8 +21,9 @@ from tslam_bench.assets.sources import CONTACTDB_WHEEL
 from tslam_bench.constants import REACHABLE_BALL_RADIUS, SIGNED_DISTANCE_TOLERANCE, WORKSPACE_EDGE
 from tslam_bench.errors import AssetError
 from tslam_bench.files import cache_directory
+from tslam_bench.sampling import iou_cells, iou_points
 
-PIPELINE_VERSION = 4
+PIPELINE_VERSION = 5
 """Bumped when the same source gives other products."""
 MIN_HULL_IOU = 0.85
 """Gate: IoU(hull union, ground truth) below this needs an explicit exception."""
@@ -148,8 +149,10 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
             raise GateError(f"gate: IoU(hull union, ground truth) {iou:.3f} is below {MIN_HULL_IOU}")
         distances = field.build_field(hulls)
         points, faces = occupancy.surface_samples(ground_truth)
-        solid_points = occupancy.solid_at_iou_points(ground_truth)
-        raw_points = occupancy.solid_at_iou_points(raw) if filled.volume > 0 else solid_points
+        cells = iou_cells(*ground_truth.bounds, truth_solid.volume())
+        compared = iou_points(*ground_truth.bounds, cells).points
+        solid_points = occupancy.solid_at(compared, ground_truth)
+        raw_points = occupancy.solid_at(compared, raw) if filled.volume > 0 else solid_points
         gates: dict[str, Any] = {
             "hull_iou": iou,
             "hull_iou_passes": iou >= MIN_HULL_IOU,
@@ -191,6 +194,7 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
             surface=occupancy.surface_grid(ground_truth),
             surface_points=points.astype(np.float32),
             surface_normals=ground_truth.face_normals()[faces].astype(np.float32),
+            iou_cells=cells,
             solid_at_iou_points=solid_points,
             raw_solid_at_iou_points=raw_points,
             record=record,

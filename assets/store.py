@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.assets import contactdb
-from tslam_bench.constants import IOU_POINTS, SURFACE_SAMPLES
+from tslam_bench.constants import SURFACE_SAMPLES
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_directory, cache_directory, sha256_file, write_json
 from tslam_bench.grids import pack, unpack
+from tslam_bench.sampling import IouPoints, iou_points
 
-FORMAT = 1
+FORMAT = 2
 """Version of the directory layout."""
 SPLITS = ("test", "train", "val")
 """The benchmark's own splits; an organiser may add others."""
@@ -78,7 +79,8 @@ class PreparedObject:
         solid: (32, 32, 32) bool, voxel centre inside the ground truth.
         surface: (32, 32, 32) bool, voxels that the true surface crosses.
         surface_points, surface_normals: (100000, 3) float32 area-uniform samples and their face normals.
-        solid_at_iou_points: (100000,) bool, ground truth at ``tslam_bench.sampling.iou_points()``.
+        iou_cells: per axis of the lattice that decides the IoU points (:meth:`iou_points`).
+        solid_at_iou_points: (N,) bool, ground truth at the N points of :meth:`iou_points`.
         raw_solid_at_iou_points: the same for the mesh whose inner voids are not filled.
         record: the manifest record: source, licence, hashes, extents, volume, hull count, gate figures.
     """
@@ -94,9 +96,14 @@ class PreparedObject:
     surface: NDArray[np.bool_]
     surface_points: NDArray[np.float32]
     surface_normals: NDArray[np.float32]
+    iou_cells: tuple[int, int, int]
     solid_at_iou_points: NDArray[np.bool_]
     raw_solid_at_iou_points: NDArray[np.bool_]
     record: dict[str, Any]
+
+    def iou_points(self) -> IouPoints:
+        """Where the IoU is measured, in the object frame; computed at each call (a few hundredths of a second)."""
+        return iou_points(self.vertices.min(axis=0), self.vertices.max(axis=0), self.iou_cells)
 
 
 def check_split(split: str, cache: Path | None = None) -> str:
@@ -234,7 +241,8 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
             values=arrays["field"].astype(np.float32),
             surface_error=float(record["field"]["surface_error"]),
         )
-        iou_bits = np.unpackbits(arrays["iou_bits"], axis=1, count=IOU_POINTS).astype(bool)
+        iou_bits = np.unpackbits(arrays["iou_bits"], axis=1, count=record["iou"]["points"]).astype(bool)
+        x, y, z = record["iou"]["cells"]
         return PreparedObject(
             name=name,
             split=split,
@@ -247,6 +255,7 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
             surface=unpack(arrays["grids"][1]),
             surface_points=arrays["surface_points"],
             surface_normals=_face_normals(arrays["vertices"], faces)[arrays["surface_faces"]],
+            iou_cells=(x, y, z),
             solid_at_iou_points=iou_bits[0],
             raw_solid_at_iou_points=iou_bits[1],
             record=record,
@@ -309,7 +318,7 @@ def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Pat
 
     Args:
         prepared: the object; ``record`` holds what the manifest says besides the fields that are added here (
-            ``format``, ``name``, ``split``, ``category``, ``field``, ``products``).
+            ``format``, ``name``, ``split``, ``category``, ``field``, ``iou``, ``products``).
         surface_faces: (100000,) the face that each surface sample lies on.
         cache: cache directory (default: the user's).
 
@@ -358,6 +367,11 @@ def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Pat
                 "spacing": prepared.field.spacing,
                 "shape": list(prepared.field.values.shape),
                 "surface_error": prepared.field.surface_error,
+            },
+            "iou": {
+                "cells": list(prepared.iou_cells),
+                "points": len(prepared.solid_at_iou_points),
+                "inside": int(prepared.solid_at_iou_points.sum()),
             },
             "products": products,
         }

@@ -14,7 +14,7 @@ import trimesh
 from tslam_bench.assets.store import PreparedObject, SignedDistanceField
 from tslam_bench.constants import GRID_SIZE, SURFACE_SAMPLES, VOXEL_EDGE
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.sampling import iou_points
+from tslam_bench.sampling import iou_cells, iou_points
 
 
 def inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
@@ -43,7 +43,9 @@ def prepare_primitive(
     grid = origin + spacing * np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
     distances = [igl.signed_distance(grid.reshape(-1, 3), v, f)[0] for v, f in hull_arrays]
     centres = voxel_centres().reshape(-1, 3)
-    solid_at_iou_points = inside(mesh, np.array(iou_points()))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    cells = iou_cells(low, high, mesh.volume)
+    solid_at_iou_points = inside(mesh, iou_points(low, high, cells).points)
     return PreparedObject(
         name=name,
         split="test",
@@ -61,6 +63,7 @@ def prepare_primitive(
         surface=crossed_voxels(mesh),
         surface_points=points.astype(np.float32),
         surface_normals=mesh.face_normals[face].astype(np.float32),
+        iou_cells=cells,
         solid_at_iou_points=solid_at_iou_points,
         raw_solid_at_iou_points=solid_at_iou_points.copy(),
         record={"name": name, "split": "test", "source": "primitive", "extents": mesh.extents.tolist()},

@@ -7,9 +7,9 @@ from manifold3d import Manifold
 from tslam_bench.assets import generate, occupancy
 from tslam_bench.assets.distance import sample_surface
 from tslam_bench.assets.meshes import from_manifold, to_manifold
-from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE
+from tslam_bench.constants import IOU_INSIDE_POINTS, VOXEL_EDGE
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.sampling import iou_points
+from tslam_bench.sampling import iou_cells, iou_points
 
 
 @pytest.fixture(scope="module")
@@ -41,17 +41,20 @@ def test_surface_grid_holds_every_voxel_with_a_sample_and_hardly_more(mug):
 
 
 def test_solid_share_of_the_iou_points_is_the_volume(mug):
-    solid = occupancy.solid_at_iou_points(mug)
-    share = to_manifold(mug).volume() / WORKSPACE_EDGE**3
-    assert solid.shape == (len(iou_points()),)
-    assert abs(solid.mean() - share) < 5 * np.sqrt(share * (1 - share) / len(solid))
+    volume = to_manifold(mug).volume()
+    compared = iou_points(*mug.bounds, iou_cells(*mug.bounds, volume))
+    solid = occupancy.solid_at(compared.points, mug)
+    assert solid.sum() == pytest.approx(IOU_INSIDE_POINTS, rel=0.1)
+    # One point per cell: better than the binomial deviation of as many uniform points, 1 / sqrt(8000) = 1.1 %.
+    assert compared.weights[solid].sum() == pytest.approx(volume, rel=0.03)
 
 
-def test_solid_at_iou_points_of_a_ball():
+def test_solid_at_points_of_a_ball():
     mesh = from_manifold(Manifold.sphere(0.06, 256))
-    radius = np.linalg.norm(iou_points(), axis=1)
+    points = iou_points(*mesh.bounds, (50, 50, 50)).points
+    radius = np.linalg.norm(points, axis=1)
     decided = np.abs(radius - 0.06) > 2e-5  # the mesh is a polyhedron
-    np.testing.assert_array_equal(occupancy.solid_at_iou_points(mesh)[decided], (radius < 0.06)[decided])
+    np.testing.assert_array_equal(occupancy.solid_at(points, mesh)[decided], (radius < 0.06)[decided])
 
 
 def test_surface_samples_are_seeded(mug):

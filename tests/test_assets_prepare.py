@@ -20,7 +20,6 @@ from tslam_bench.assets.pipeline import GateError, check_gates, check_size, para
 from tslam_bench.assets.sources import CONTACTDB_WHEEL
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
-from tslam_bench.sampling import iou_points
 
 CHEAP = [generate.GeneratedSource("train", "carton", 1), generate.GeneratedSource("train", "book", 0)]
 
@@ -39,7 +38,7 @@ def test_products_fit_each_other(cache):
     prepared = store.load_object("book-000", "train", cache)
     mesh = TriangleMesh(prepared.vertices, prepared.faces)
     np.testing.assert_allclose(mesh.bounds.sum(axis=0), 0, atol=1e-12)
-    np.testing.assert_array_equal(prepared.solid_at_iou_points, contains(iou_points(), mesh))
+    np.testing.assert_array_equal(prepared.solid_at_iou_points, contains(prepared.iou_points().points, mesh))
     np.testing.assert_array_equal(prepared.solid_at_iou_points, prepared.raw_solid_at_iou_points)
     assert prepared.solid.any()
     assert prepared.surface.sum() > prepared.solid.sum() / 2

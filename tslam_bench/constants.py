@@ -62,8 +62,16 @@ SURFACE_SAMPLES: Final = 100_000
 """Area-uniform samples per true surface, and per predicted one."""
 
 # --- Section 10: metrics ---------------------------------------------------------------------------------------
-IOU_POINTS: Final = 100_000
-"""Uniform points in W at which solid occupancies are compared."""
+IOU_BOX_MARGIN: Final = 16e-3
+"""The fine lattice of IoU points covers the object's bounding box grown by this (m)."""
+IOU_INSIDE_POINTS: Final = 8_000
+"""IoU points wanted inside an object: the standard deviation over point sets of an IoU is then at most .005."""
+IOU_BOX_POINTS: Final = 80_000
+"""Fewest IoU points in an object's grown box."""
+IOU_MOST_BOX_POINTS: Final = 1_000_000
+"""Most IoU points in an object's grown box. Of the test objects only the eyeglasses meet this bound."""
+IOU_OUTER_CELLS: Final = 40
+"""Cells per axis of the coarse lattice of IoU points, which covers what is left of W."""
 OCCUPANCY_THRESHOLD: Final = 0.5
 """A reconstruction is solid where its probability is at least this."""
 F_SCORE_DISTANCES: Final = (0.01, 0.02)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,12 +17,12 @@ from rich.table import Table
 from tqdm import tqdm
 
 from tslam_bench.assets import contactdb, store
-from tslam_bench.constants import QUICK_OBJECTS
+from tslam_bench.constants import DEFAULT_SPLIT, QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, write_json
 
-QUICK_GENERATED = {"train": 24, "val": 6}
-"""Generated objects of the quick run."""
+QUICK = {"test": QUICK_OBJECTS, "train": QUICK_TRAIN_OBJECTS, "val": QUICK_VAL_OBJECTS}
+"""Objects of the quick set-up."""
 FULL_GENERATED = {"train": 600, "val": 60}
 """Objects of a set that is generated only."""
 FURNITURE_PER_CATEGORY = 15
@@ -36,7 +36,8 @@ class Prepare:
     """Fetch or generate objects, repair, decompose and measure them, and write the split's manifest.
 
     Objects that are intact in the cache are skipped; corrupt or missing files are named and rebuilt. Preparing the test
-    split also converts the hand, if that has not been done.
+    split also converts the hand, if that has not been done. --quick alone prepares five test objects, the hand, and
+    24 train objects to draw from.
     """
 
     objects: tuple[str, ...] = ()
@@ -45,8 +46,8 @@ class Prepare:
     """Only convert the hand."""
     quick: bool = False
     """Only the objects of the quick run."""
-    split: str = "test"
-    """Split: test, train or val."""
+    split: str | None = None
+    """Split: test (the default), train or val."""
     source: Literal["all", "furniture", "generated"] = "all"
     """Where train and val objects come from: real household models, the generator, or both."""
     count: int | None = None
@@ -172,7 +173,8 @@ def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
         if unknown:
             raise InvalidInputError(f"object {unknown[0]!r}: not in {command.manifest}")
         return split, [source for source in own if not command.objects or source.name in command.objects], None
-    split = store.SPLIT_ALIASES.get(command.split, command.split)
+    asked = command.split or "test"
+    split = store.SPLIT_ALIASES.get(asked, asked)
     if split not in store.SPLITS:
         raise InvalidInputError(
             f"split {command.split!r}: unknown; choose one of {', '.join(store.SPLITS)}, or use --manifest or import"
@@ -182,11 +184,13 @@ def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
     if split == "test":
         if command.source != "all" or command.count is not None:
             raise InvalidInputError("--source, --count: the test split is fixed; --objects NAME ... takes a part of it")
-        names = command.objects or (QUICK_OBJECTS if command.quick else tuple(contactdb.OBJECTS))
+        names = command.objects or (QUICK["test"] if command.quick else tuple(contactdb.OBJECTS))
         resolved = dict.fromkeys(store.resolve_name(name, "test") for name in names)
         # Those that take longest go first, so that no worker is left alone with one in the end.
         longest_first = sorted(resolved, key=lambda name: -settings_for("test", name).max_hulls)
         return split, [ContactDBSource(name) for name in longest_first], None
+    if command.quick and not command.objects and command.count is None:
+        command = replace(command, objects=QUICK[split])
     generated, real = _training_sources(command, split)
     if command.objects:
         by_name = {source.name: source for source in [*generated, *real]}
@@ -195,7 +199,7 @@ def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
             raise InvalidInputError(f"object {unknown[0]!r}: not in split {split} (source: {command.source})")
         return split, [by_name[name] for name in command.objects], None
     if command.quick:
-        return split, generated, command.count or QUICK_GENERATED[split]
+        return split, generated, command.count
     if command.source == "generated":
         return split, generated, command.count or FULL_GENERATED[split]
     return split, [*real, *generated], command.count
@@ -288,6 +292,8 @@ def _prepare(command: Prepare) -> None:
     summary = ", ".join(f"{number} {status}" for status, number in tally.items())
     print(f"{summary}; {time.monotonic() - started:.0f} s; manifest: {path}")
     _complain(split, outcomes, count, strict=split == "test" or command.manifest is not None or bool(command.objects))
+    if command.quick and command.split is None and not command.objects:
+        _prepare(replace(command, split=DEFAULT_SPLIT, write_manifest=None))
 
 
 def _renew_val_manifest(split: str) -> None:

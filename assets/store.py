@@ -176,6 +176,24 @@ def resolve_name(name: str, split: str = "test", cache: Path | None = None) -> s
     )
 
 
+def find_split(name: str, cache: Path | None = None) -> str:
+    """The benchmark's split that has an object of this name (or alias): test, train or val.
+
+    Raises:
+        InvalidInputError: none has; the message lists near matches.
+    """
+    for split in SPLITS:
+        if name in known_names(split, cache) or (split == "test" and name in contactdb.ALIASES):
+            return split
+    if name in contactdb.EXCLUDED:
+        return "test"  # whoever loads it learns why it is left out
+    candidates = [known for split in SPLITS for known in known_names(split, cache)]
+    raise InvalidInputError(
+        f"object {name!r}: unknown in the splits {', '.join(SPLITS)}{_suggest(name, [*candidates, *contactdb.ALIASES])}; "
+        "see: tslam-bench assets list --split SPLIT"
+    )
+
+
 def read_record(name: str, split: str, cache: Path | None = None) -> dict[str, Any]:
     """Manifest record of one prepared object (canonical name and split).
 

@@ -71,6 +71,9 @@ class EvaluateArguments:
     """Folder for rollouts/ and submissions/."""
     deterministic: bool = False
     """A learned explorer acts by the mean of its policy instead of sampling."""
+    policy_salt: str | None = None
+    """Hexadecimal digits that the explorer's random numbers and the order of the episodes come from; default: drawn at random,
+    or that of the episodes which are there. It is recorded in the submission."""
     label: str = ""
     """Remark shown beside every figure."""
     processes: int | None = None
@@ -141,6 +144,7 @@ def _evaluate(arguments: list[str]) -> None:
         object_set=parsed.object_set,
         model=parsed.model,
         deterministic=parsed.deterministic,
+        policy_salt=parsed.policy_salt,
         label=parsed.label,
         processes=parsed.processes,
     )

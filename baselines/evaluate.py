@@ -26,6 +26,7 @@ from tslam_bench.baselines.registry import BaselineSpec, get_baseline, make_base
 from tslam_bench.baselines.rollout import Rollout, roll_out_batch
 from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.episodes import check_salt, new_salt, shuffled
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
 from tslam_bench.grids import merge, world_to_object
@@ -53,6 +54,8 @@ class EvaluationConfig:
         object_set: ``quick`` or ``test``: which ranking the submissions are for.
         model: directory of the trained model of a learned baseline.
         deterministic: a learned baseline acts by the mean of its policy.
+        policy_salt: hexadecimal digits from which the explorer's random numbers and the order of the episodes come; None
+            takes that of the episodes which are there already, or draws one.
         label: remark that is shown beside every figure of the submission.
         processes: worker processes that simulate; None means the cores. Results do not depend on it.
     """
@@ -63,11 +66,14 @@ class EvaluationConfig:
     object_set: Literal["quick", "test"] = "test"
     model: Path | None = None
     deterministic: bool = False
+    policy_salt: str | None = None
     label: str = ""
     processes: int | None = None
 
     def __post_init__(self) -> None:
         get_baseline(self.baseline)
+        if self.policy_salt is not None:
+            check_salt(self.policy_salt)
         if not self.objects or not self.seeds:
             raise InvalidInputError("evaluation: give at least one object and one seed")
         if min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
@@ -126,12 +132,11 @@ def evaluate(
     spec = get_baseline(config.baseline)
     report = on_progress or (lambda stage, done, total: None)
     folder = output / "rollouts" / spec.id
-    if spec.kind != "reference":
-        explore(config, folder, report)
+    source = explore(config, folder, report) if spec.kind != "reference" else {}
     submissions = []
     for name, reconstructor in reconstructors.items():
         submission = output / "submissions" / f"{spec.id}-{name}"
-        with SubmissionWriter(submission, submission_info(config, name)) as writer:
+        with SubmissionWriter(submission, submission_info(config, name, source)) as writer:
             total = len(config.objects) * len(config.seeds)
             for done, (object_name, seed) in enumerate(_repetitions(config)):
                 _add_object(writer, spec, folder, reconstructor, object_name, seed)
@@ -140,35 +145,48 @@ def evaluate(
     return submissions
 
 
-def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, int], None]) -> None:
-    """Rolls out every episode that ``folder`` lacks.
+def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, int], None]) -> dict[str, Any]:
+    """Rolls out every episode that ``folder`` lacks, in an order that the salt shuffles.
+
+    Returns:
+        what the episodes depend on: the content of ``source.json``.
 
     Raises:
-        InvalidInputError: ``folder`` holds episodes of another model or of other assets.
+        InvalidInputError: ``folder`` holds episodes of another model, of other assets or of another salt.
     """
     baseline = make_baseline(config.baseline, config.model, config.deterministic)
-    source = _source(config)
     path = ensure_writable_directory(folder) / SOURCE_FILE
-    if path.is_file() and json.loads(path.read_text(encoding="utf-8")) != source:
-        raise InvalidInputError(
-            f"{folder}: holds episodes of another model or of other assets; delete it or move it away"
-        )
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    salt = config.policy_salt or known.get("policy_salt") or new_salt()
+    source = _source(config, baseline.control_mode, salt)
+    if known not in ({}, source):
+        differing = ", ".join(key for key in source if known.get(key) != source[key])
+        raise InvalidInputError(f"{folder}: holds other episodes (another {differing}); delete it or move it away")
     write_json(path, source)
     episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
-    missing = [e for e in episodes if not episode_path(folder, *e).is_file()]
+    missing = [e for e in shuffled(salt, episodes) if not episode_path(folder, *e).is_file()]
     report("explore", len(episodes) - len(missing), len(episodes))
     if not missing:
-        return
+        return source
     width, done = min(SIDE_BY_SIDE, len(missing)), len(episodes) - len(missing)
-    envs = tslam_bench.make_vec(ENVIRONMENT_ID, width, "cpu", objects=config.objects, processes=config.processes)
+    envs = tslam_bench.make_vec(
+        ENVIRONMENT_ID,
+        width,
+        "cpu",
+        objects=config.objects,
+        split="test",
+        control_mode=baseline.control_mode,
+        processes=config.processes,
+    )
     try:
         for first in range(0, len(missing), width):
-            for rollout in roll_out_batch(envs, baseline, missing[first : first + width]):
+            for rollout in roll_out_batch(envs, baseline, missing[first : first + width], salt):
                 rollout.save(episode_path(folder, rollout.object, rollout.pose, rollout.seed))
                 done += 1
                 report("explore", done, len(episodes))
     finally:
         envs.close()
+    return source
 
 
 def episode_path(folder: Path, object_name: str, pose: int, seed: int) -> Path:
@@ -207,8 +225,11 @@ def manifest_sha256(config: EvaluationConfig) -> str:
         return asset_sha256(config.objects)
 
 
-def submission_info(config: EvaluationConfig, reconstructor: str) -> SubmissionInfo:
-    """What the submission says about itself; budget and hardware come from the model's metadata."""
+def submission_info(config: EvaluationConfig, reconstructor: str, source: Mapping[str, Any]) -> SubmissionInfo:
+    """What the submission says about itself; budget and hardware come from the model's metadata.
+
+    ``source`` is what :func:`explore` returned, empty for a reference.
+    """
     spec = get_baseline(config.baseline)
     training = Training()
     if spec.kind == "learned" and config.model is not None:
@@ -270,13 +291,15 @@ def _model_metadata(model: Path) -> dict[str, Any]:
     return json.loads((model / METADATA_FILE).read_text(encoding="utf-8"))
 
 
-def _source(config: EvaluationConfig) -> dict[str, Any]:
+def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str, Any]:
     """What the episodes depend on besides object, pose and seed."""
     model = None if config.model is None else sha256_file(config.model / MODEL_FILE)
     return {
         "baseline": config.baseline,
         "model_sha256": model,
         "deterministic": config.deterministic,
+        "control_mode": control_mode,
+        "policy_salt": salt,
         "asset_manifest_sha256": asset_sha256(config.objects),
         "package_version": tslam_bench.__version__,
         "environment": ENVIRONMENT_ID,

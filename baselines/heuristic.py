@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.baselines.interface import check_observation, episode_generators
 from tslam_bench.constants import NUM_JOINTS
-from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES
+from tslam_bench.hand_constants import CONTROL_MODES, DELTA_STEP, JOINT_LIMITS, JOINT_NAMES
 
 _TRAVEL, _SINK, _CLOSE, _OPEN = range(4)
 _INDEX: Final = {name: index for index, name in enumerate(JOINT_NAMES)}
@@ -72,7 +72,9 @@ class GraspConfig:
 
 
 class HeuristicBaseline:
-    """See the module's docstring. Actions are those of ``pd_joint_delta_pos``."""
+    """See the module's docstring."""
+
+    control_mode = CONTROL_MODES[0]
 
     def __init__(self, config: GraspConfig | None = None) -> None:
         self.config = config or GraspConfig()

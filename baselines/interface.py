@@ -16,8 +16,14 @@ class Baseline(Protocol):
     """A policy that explores ``num_envs`` objects side by side.
 
     All random numbers of an episode come from that episode's seed, so the actions do not depend on which other episodes
-    share the batch.
+    share the batch. Nothing that it is given names the object: seeds come from a salt it does not know, and an
+    evaluation plays its episodes in shuffled order (:mod:`tslam_bench.episodes`).
+
+    Attributes:
+        control_mode: one of ``CONTROL_MODES``: what its actions mean. Evaluation makes the environment accordingly.
     """
+
+    control_mode: str
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """Begins ``num_envs`` episodes.

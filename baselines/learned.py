@@ -21,7 +21,7 @@ from tslam_bench.baselines.registry import BaselineSpec
 from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.hand_constants import JOINT_LIMITS
+from tslam_bench.hand_constants import CONTROL_MODES, JOINT_LIMITS
 
 
 def build_policy(metadata: Mapping[str, Any]) -> MultiInputActorCriticPolicy:
@@ -53,6 +53,8 @@ class LearnedBaseline:
     The noise comes from each episode's seed. The paper acts by the mean; early in training the mean is close to
     standing still, so sampling, which is also what was optimised, is the default.
     """
+
+    control_mode = CONTROL_MODES[0]
 
     def __init__(self, policy: MultiInputActorCriticPolicy, deterministic: bool = False) -> None:
         self._policy = policy

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from tslam_bench.baselines.interface import check_observation, episode_generators
 from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.hand_constants import CONTROL_MODES
 
 
 class RandomBaseline:
-    """Uniform actions, drawn for one horizon at a time so that a step costs one array read."""
+    """Uniform actions of ``pd_joint_delta_pos``, drawn for one horizon at a time so that a step costs one array read."""
+
+    control_mode = CONTROL_MODES[0]
 
     def __init__(self) -> None:
         self._generators: list[np.random.Generator] = []

@@ -36,6 +36,7 @@ def _learned(identifier: str, reward_mode: str, summary: str, privileged: bool =
 
 _SPECS = (
     BaselineSpec("random", "uniform actions each step", "scripted"),
+    BaselineSpec("random_targets", "random absolute joint targets, each held for four steps", "scripted"),
     BaselineSpec("heuristic", "power grasp from a randomly placed open hand, reopened and repeated", "scripted"),
     _learned("tslam", "tslam", "PPO on novel touched voxels plus coverage of free space"),
     _learned("tslam_no_coverage", "no_coverage", "PPO on novel touched voxels alone"),
@@ -54,7 +55,7 @@ _BY_ID = {spec.id: spec for spec in _SPECS}
 
 
 def list_baselines() -> tuple[BaselineSpec, ...]:
-    """All registered explorers: the ten baselines in the order of protocol section 11, then the references."""
+    """All registered explorers: the baselines in the order of protocol section 11, then the references."""
     return _SPECS
 
 
@@ -97,6 +98,10 @@ def make_baseline(identifier: str, model: Path | None = None, deterministic: boo
         from tslam_bench.baselines.random_actions import RandomBaseline
 
         return RandomBaseline()
+    if identifier == "random_targets":
+        from tslam_bench.baselines.random_targets import RandomTargetsBaseline
+
+        return RandomTargetsBaseline()
     from tslam_bench.baselines.heuristic import HeuristicBaseline
 
     return HeuristicBaseline()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tslam_bench.baselines.interface import Baseline
 from tslam_bench.baselines.vector import observation_to_numpy, to_numpy
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
-from tslam_bench.episodes import episode_seed
+from tslam_bench.episodes import Episode, episode_seed, policy_seed
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file
 from tslam_bench.grids import check_pose, pack, unpack
@@ -28,7 +28,7 @@ class Rollout:
     """What one episode left.
 
     Attributes:
-        object, pose, seed: what was explored; the episode's seed is ``episode_seed(object, pose, seed)``.
+        object, pose, seed: what was explored; the episode's seed is ``episode_seed(pose, seed)``.
         actions: (200, 28) float32.
         touched, visited: (32, 32, 32) bool, world frame, at the end.
         touched_step: (32, 32, 32) int16, control step (0 = first) of a voxel's first touch, -1 never; world frame.
@@ -87,10 +87,10 @@ class Rollout:
         return rollout
 
 
-def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed: int) -> Rollout:
+def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed: int, salt: str) -> Rollout:
     """Lets ``baseline`` explore ``object_name`` in ``pose`` for one episode.
 
-    The environment starts from ``episode_seed(object_name, pose, seed)``, and so does the baseline: equal arguments
+    The environment starts from ``episode_seed(pose, seed)``, the baseline from ``policy_seed(salt, ...)``: equal arguments
     give equal episodes, bit for bit on one machine.
 
     Args:
@@ -99,17 +99,17 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
         object_name: a prepared object of the environment's split.
         pose: 0..7.
         seed: repetition.
+        salt: hexadecimal digits that the baseline's random numbers come from.
 
     Raises:
-        InvalidInputError: unknown object or pose, an environment of several sub-environments, or an episode that does
+        InvalidInputError: unknown object or pose, not a salt, an environment of several sub-environments, or an episode that does
             not end after 200 steps.
     """
     pose = check_pose(pose)
     if getattr(env.unwrapped, "num_envs", 1) != 1:
         raise InvalidInputError(f"environment: has {env.unwrapped.num_envs} sub-environments, expected 1")  # type: ignore[attr-defined]
-    start = episode_seed(object_name, pose, seed)
-    baseline.reset(1, start)
-    raw, _ = env.reset(seed=start, options={"object": object_name, "pose": pose})
+    baseline.reset(1, [policy_seed(salt, (object_name, pose, seed))])
+    raw, _ = env.reset(seed=episode_seed(pose, seed), options={"object": object_name, "pose": pose})
     actions = np.zeros((HORIZON, NUM_JOINTS), dtype=np.float32)
     episode_return = 0.0
     for step in range(HORIZON):
@@ -131,7 +131,7 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
     )
 
 
-def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[tuple[str, int, int]]) -> list[Rollout]:
+def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[Episode], salt: str) -> list[Rollout]:
     """Lets ``baseline`` explore several (object, pose, seed) side by side.
 
     Bit for bit what :func:`roll_out` gives for each of them.
@@ -140,6 +140,7 @@ def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[tuple
         envs: what ``tslam_bench.make_vec`` returned.
         baseline: the policy; it is reset here.
         episodes: at most ``envs.num_envs`` of them.
+        salt: hexadecimal digits that the baseline's random numbers come from.
 
     Raises:
         InvalidInputError: too many episodes or none, unknown object or pose, or episodes that do not end after 200 steps.
@@ -148,8 +149,8 @@ def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[tuple
     if not 0 < count <= envs.num_envs:
         raise InvalidInputError(f"episodes: {count} given for {envs.num_envs} environments; give 1 to {envs.num_envs}")
     filled = [*episodes, *[episodes[-1]] * (envs.num_envs - count)]  # idle environments repeat the last one
-    starts: Any = [episode_seed(name, pose, seed) for name, pose, seed in filled]  # Gymnasium's type is one number
-    baseline.reset(envs.num_envs, starts)
+    starts: Any = [episode_seed(pose, seed) for _, pose, seed in filled]  # Gymnasium's type is one number
+    baseline.reset(envs.num_envs, [policy_seed(salt, episode) for episode in filled])
     options = {"object": [name for name, _, _ in filled], "pose": [pose for _, pose, _ in filled]}
     raw, _ = envs.reset(seed=starts, options=options)
     actions = np.zeros((HORIZON, envs.num_envs, NUM_JOINTS), dtype=np.float32)

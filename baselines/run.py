@@ -23,7 +23,7 @@ from tslam_bench.assets.store import asset_sha256, known_names, list_objects
 from tslam_bench.baselines.jobs import Job, JobRunner
 from tslam_bench.baselines.registry import get_baseline, list_baselines
 from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
-from tslam_bench.constants import QUICK_OBJECTS
+from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
 from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.leaderboard.submission import INFO_FILE
 from tslam_bench.reconstruction.registry import get_reconstructor
@@ -71,42 +71,6 @@ _SMALL_TRAINING: Final = (
     *("--network", "small", "--num-envs", "4", "--rollout-steps", "200", "--batch-size", "200", "--epochs", "4"),
     *("--checkpoint-every", "1600"),
 )
-QUICK_TRAINING_OBJECTS: Final = (
-    "bottle-000",
-    "bowl-000",
-    "tumbler-000",
-    "goblet-000",
-    "mug-000",
-    "frying-pan-000",
-    "cooking-pot-000",
-    "teapot-000",
-    "plate-000",
-    "padlock-000",
-    "candlestick-000",
-    "mallet-000",
-    "screwdriver-000",
-    "spoon-000",
-    "wrench-000",
-    "paint-brush-000",
-    "key-000",
-    "comb-000",
-    "carton-000",
-    "spectacles-000",
-    "toaster-000",
-    "book-000",
-    "bangle-000",
-    "picture-frame-000",
-)
-"""Generated train objects of the quick run that pass the gates, by name: what else is prepared must not change its results."""
-QUICK_VALIDATION_OBJECTS: Final = (
-    "bucket-000",
-    "mushroom-000",
-    "rocket-000",
-    "cogwheel-000",
-    "trophy-000",
-    "bench-000",
-)
-"""Generated val objects on which the quick run fixes thresholds."""
 PRESETS: Final[dict[str, RunSettings]] = {
     "quick": RunSettings(
         name="quick",
@@ -116,7 +80,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         seeds=(0,),
         steps=4000,
         training=_SMALL_TRAINING,
-        learning_objects=(("train", QUICK_TRAINING_OBJECTS), ("val", QUICK_VALIDATION_OBJECTS)),
+        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "300"),
         remark="proves the path, not the method",
@@ -140,7 +104,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
             "--epochs",
             "1",
         ),
-        learning_objects=(("train", QUICK_TRAINING_OBJECTS[:2]),),
+        learning_objects=(("train", QUICK_TRAIN_OBJECTS[:2]),),
         reconstructors=("grid", "hull", "ifnet"),
         reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
         remark="shows that everything runs, nothing else",
@@ -247,7 +211,7 @@ def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
     """These look into the cache, which others change too: they always run, and take seconds if all is there."""
     prepare: Command = ("tslam-bench", "assets", "prepare")
     several: Command = ("--workers", str(workers))
-    test_objects = ("--quick",) if settings.objects == QUICK_OBJECTS else _objects(settings)
+    test_objects = ("--quick", "--split", "test") if settings.objects == QUICK_OBJECTS else _objects(settings)
 
     def test_assets() -> str:
         return asset_sha256(settings.objects or known_names("test"))

@@ -55,7 +55,7 @@ class BatchSettings:
 
     object: str | None = None
     objects: tuple[str, ...] | None = None
-    split: str = "test"
+    split: str | None = None
     pose: int | None = None
     reward_mode: str = "tslam"
     control_mode: str = CONTROL_MODES[0]

@@ -52,7 +52,7 @@ class Video:
     environment: str = ENVIRONMENT_ID
     """Environment id."""
     object: str = "mug"
-    """Object of the test split."""
+    """A prepared object of any split."""
     pose: int = 0
     """Pose, one of the environment's."""
     baseline: str = "heuristic"
@@ -192,7 +192,13 @@ def _video(command: Video) -> None:
     from tslam_bench.baselines.registry import make_baseline  # a command may use what the library must not
 
     explorer = make_baseline(command.baseline)
-    environment = gymnasium.make(variant.id, object=command.object, pose=command.pose, render_mode="rgb_array")
+    environment = gymnasium.make(
+        variant.id,
+        object=command.object,
+        pose=command.pose,
+        control_mode=explorer.control_mode,
+        render_mode="rgb_array",
+    )
     observation, _ = environment.reset(seed=command.seed)
     explorer.reset(1, command.seed)
     frames = []

@@ -54,8 +54,10 @@ class DriveTargets:
         action = clip(action, -1.0, 1.0)
         if self.mode == "pd_joint_delta_pos":
             target = qpos + action * self._delta
-        else:
-            target = self._middle_range + action * self._half_range
+        else:  # no faster than the other mode: the goal may be anywhere, the target is within a step of the joint
+            away = self._middle_range + action * self._half_range - qpos
+            xp = self._backend.module
+            target = qpos + xp.minimum(xp.maximum(away, -self._delta), self._delta)
         coupled = _couple(self._clip_to_limits(target), self._backend, *self._coupled)
         return _pull_back(self._clip_to_limits(coupled), self._backend, *self._coupled)
 

@@ -62,7 +62,7 @@ class TactileSLAMEnv(BaseEnv):
 
     **Actions.** ``Box(-1, 1, (28,), float32)``, one number per joint of ``tslam_bench.hand_constants.JOINT_NAMES``.
     ``control_mode="pd_joint_delta_pos"`` (default) moves each target by up to ``DELTA_STEP`` from the current position;
-    ``"pd_joint_pos"`` maps [-1, 1] to the joint limits.
+    ``"pd_joint_pos"`` maps [-1, 1] to the joint limits and moves each target towards there by at most ``DELTA_STEP``.
 
     **Observations** (a dict of batched tensors, E environments): ``qpos`` (E, 28) and ``qvel`` (E, 28) in m, rad and per
     second; ``touch`` (E, 18) 0/1 per skin link; ``occupancy`` (E, 2, 32, 32, 32) 0/1, channel 0 touched and channel 1
@@ -70,14 +70,16 @@ class TactileSLAMEnv(BaseEnv):
 
     **Rewards.** ``reward_mode`` is one of ``tslam_bench.constants.REWARD_MODES`` (section 7), or ``"none"``.
 
-    **Starting state.** Arm uniform in ``START_ARM_LOW..HIGH``, above the object; fingers open with small noise; nothing touched.
+    **Starting state.** Arm uniform in ``START_ARM_LOW..HIGH``, above the workspace; fingers open with small noise; nothing
+    touched. It follows from seed and pose alone: the first observation is the same for every object.
 
     **Episode end.** Truncated at step 200, never terminated.
 
     Args:
         object: name of one object for every episode; None draws one per episode.
         objects: names to draw from; None means the whole split.
-        split: ``test``, ``train``, ``val``, or the name of a private split.
+        split: ``test``, ``train``, ``val``, or the name of a private split; None: named objects are found in whatever split has
+            them, and without names episodes draw from what is prepared of ``train``.
         pose: 0..7 for every episode (section 3); None draws one per episode.
         num_envs: environments; more than one needs a GPU.
         reward_mode, control_mode, obs_mode, render_mode: as above and in ManiSkill.
@@ -105,7 +107,7 @@ class TactileSLAMEnv(BaseEnv):
         *args: Any,
         object: str | None = None,
         objects: Sequence[str] | None = None,
-        split: str = "test",
+        split: str | None = None,
         pose: int | None = None,
         num_envs: int = 1,
         obs_mode: str = "state_dict",
@@ -134,7 +136,6 @@ class TactileSLAMEnv(BaseEnv):
             raise InvalidInputError(f"num_envs {num_envs}: must be a whole number from 1 to {MAX_GPU_ENVIRONMENTS}")
         self._wants_gpu, self._asked_num_envs = wants_gpu, num_envs
         self._starts = StartSampler(object, objects, split, pose, self.VARIANT)
-        self.split = split
         self.object_name: list[str] = [""] * num_envs
         self.pose: list[int] = [0] * num_envs
         self._bodies: dict[str, sapien.Entity] = {}

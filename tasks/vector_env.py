@@ -10,6 +10,7 @@ import selectors
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +19,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tslam_bench.assets.store import resolve_name
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
@@ -85,8 +85,10 @@ class TactileVectorEnv(VectorEnv):
         if not isinstance(timeout, (int, float)) or not 0 < timeout < float("inf"):
             raise InvalidInputError(f"timeout {timeout!r}: must be a number of seconds above 0")
         self._timeout = float(timeout)
-        self._split = settings.split
-        self._variant = settings.sampler().variant  # fail here, in one line, rather than in a worker
+        self._starts = settings.sampler()  # fail here, in one line, rather than in a worker
+        self._variant = self._starts.variant
+        if settings.object is None:  # workers need not list the split again, nor repeat its warning
+            settings = replace(settings, objects=self._starts.names)
         self.num_envs = int(num_envs)
         self.single_observation_space = observation_space()
         self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
@@ -148,7 +150,7 @@ class TactileVectorEnv(VectorEnv):
             self._variant.check_pose(pose)
         for name in names or ():
             if name is not None:
-                resolve_name(name, self._split)
+                self._starts.check_name(name)
         for part, (_, pipe) in zip(self._slices, self._workers, strict=True):
             envs = np.flatnonzero(mask[part]).tolist()
             chosen = [part.start + env for env in envs]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -14,10 +15,19 @@ import torch
 
 import tslam_bench
 from tslam_bench import grids
-from tslam_bench.assets.store import load_object
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
+from tslam_bench.assets import store
+from tslam_bench.assets.contactdb import OBJECTS
+from tslam_bench.assets.store import load_object, prepared_names
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, TRAIN_OBJECTS, VOXEL_EDGE
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.hand_constants import COUPLING_END, COUPLING_MIDDLE, COUPLING_SLACK, JOINT_LIMITS, SKIN_LINKS
+from tslam_bench.hand_constants import (
+    COUPLING_END,
+    COUPLING_MIDDLE,
+    COUPLING_SLACK,
+    DELTA_STEP,
+    JOINT_LIMITS,
+    SKIN_LINKS,
+)
 from tslam_bench.tasks.arrays import NumpyBackend
 from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
 from tslam_bench.tasks.rendering import vulkan_device_available
@@ -106,10 +116,25 @@ def test_drive_targets_respect_limits_and_tendons():
         assert (target >= JOINT_LIMITS[:, 0] - 1e-6).all() and (target <= JOINT_LIMITS[:, 1] + 1e-6).all()
         stretch = COUPLING_END * target[:, END] - COUPLING_MIDDLE * target[:, MIDDLE]
         assert np.abs(stretch).max() <= COUPLING_SLACK + 1e-6
-    extreme = DriveTargets("pd_joint_pos", NumpyBackend())(
-        np.ones((1, NUM_JOINTS), np.float32), np.zeros((1, NUM_JOINTS))
+
+
+def test_absolute_targets_move_no_faster_than_relative_ones():
+    """An absolute action is the relative one that goes straight to its goal: clip((goal - qpos) / step limit)."""
+    generator = np.random.default_rng(1)
+    middle, half = JOINT_LIMITS.mean(axis=1), np.ptp(JOINT_LIMITS, axis=1) / 2
+    qpos = generator.uniform(*JOINT_LIMITS.T, (200, NUM_JOINTS)).astype(np.float32)
+    action = generator.uniform(-1, 1, (200, NUM_JOINTS)).astype(np.float32)
+    toward = np.clip((middle + action * half - qpos) / DELTA_STEP, -1, 1).astype(np.float32)
+    absolute = DriveTargets("pd_joint_pos", NumpyBackend())(action, qpos)
+    relative = DriveTargets("pd_joint_delta_pos", NumpyBackend())(toward, qpos)
+    np.testing.assert_allclose(absolute, relative, atol=1e-6)
+    near = (
+        np.abs(middle + action * half - qpos) < DELTA_STEP
+    )  # there, the goal is the target (tendons and limits aside)
+    free = [0, 1, 2, 3, 4, 5]
+    np.testing.assert_allclose(
+        absolute[:, free][near[:, free]], (middle + action * half)[:, free][near[:, free]], atol=1e-6
     )
-    np.testing.assert_allclose(extreme[0, 0], JOINT_LIMITS[0, 1], rtol=1e-6)
 
 
 def test_joints_reach_their_targets():
@@ -119,7 +144,8 @@ def test_joints_reach_their_targets():
     action[1] = 1.0  # up and away from the object
     for _ in range(120):
         observation, *_ = env.step(action)
-    expected = DriveTargets("pd_joint_pos", NumpyBackend())(action[None], np.zeros((1, NUM_JOINTS), np.float32))
+    goal = (JOINT_LIMITS.mean(axis=1) + action * np.ptp(JOINT_LIMITS, axis=1) / 2).astype(np.float32)
+    expected = DriveTargets("pd_joint_pos", NumpyBackend())(action[None], goal[None])
     np.testing.assert_allclose(observation["qpos"].numpy(), expected, atol=5e-3)
     assert np.abs(observation["qvel"].numpy()).max() < 0.05
     env.close()
@@ -145,6 +171,27 @@ def test_bad_arguments_get_one_line(arguments, message):
     with pytest.raises(InvalidInputError, match=message) as caught:
         gym.make(ENVIRONMENT_ID, **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_a_default_environment_draws_from_train(recwarn):
+    env = gym.make(ENVIRONMENT_ID)
+    names = set(env.unwrapped._starts.names)
+    assert names == set(prepared_names("train")) and not names & set(OBJECTS)
+    said = [str(warning.message) for warning in recwarn if "episodes draw from" in str(warning.message)]
+    if len(names) < TRAIN_OBJECTS:
+        assert len(said) == 1 and "tslam-bench assets prepare --split train" in said[0]
+    else:
+        assert not said
+    env.reset(seed=0)
+    assert env.unwrapped.object_name[0] in names
+    env.reset(seed=0, options={"object": "mug"})  # a named object is found where it is
+    assert env.unwrapped.object_name == ["mug"]
+    env.close()
+
+
+def test_the_default_set_has_as_many_objects_as_its_manifest():
+    manifest = json.loads((Path(store.__file__).parent / "manifest_train.json").read_text(encoding="utf-8"))
+    assert len(manifest["objects"]) == TRAIN_OBJECTS
 
 
 def test_bad_actions_get_one_line(environment):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from baseline_assets import SHAPES, primitive_cache
 from test_baselines import METADATA
 
 import tslam_bench
+from tslam_bench.baselines import evaluate as evaluation
 from tslam_bench.baselines.evaluate import (
     EvaluationConfig,
     episode_path,
@@ -26,12 +28,13 @@ from tslam_bench.baselines.learned import LearnedBaseline, build_policy
 from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.rollout import Rollout, roll_out, roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
-from tslam_bench.episodes import episode_seed
+from tslam_bench.episodes import check_salt, episode_seed, new_salt, policy_seed, shuffled
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.grids import voxel_centres, world_to_object
 from tslam_bench.leaderboard.submission import read_submission
 
+SALT = "5a17"
 PHONE = np.array(SHAPES["test"]["phone"]) / 2
 
 
@@ -48,7 +51,7 @@ def rollouts(cache) -> list[Rollout]:
     """The heuristic on the phone in every pose."""
     env = gym.make(ENVIRONMENT_ID, render_backend="none")
     try:
-        return [roll_out(env, make_baseline("heuristic"), "phone", pose, 0) for pose in range(8)]
+        return [roll_out(env, make_baseline("heuristic"), "phone", pose, 0, SALT) for pose in range(8)]
     finally:
         env.close()
 
@@ -61,10 +64,82 @@ def distance_to_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def test_episode_seeds_are_fixed_and_differ() -> None:
-    seeds = {episode_seed(name, pose, seed) for name in ("mug", "hammer") for pose in range(8) for seed in range(3)}
+    seeds = {episode_seed(pose, seed) for pose in range(8) for seed in range(6)}
     assert len(seeds) == 48 and all(0 <= seed < 2**31 for seed in seeds)
+    assert episode_seed(3, 1) == int(hashlib.sha256(b"pose3/seed1").hexdigest()[:8], 16) >> 1
     with pytest.raises(InvalidInputError, match="pose 8"):
-        episode_seed("mug", 8, 0)
+        episode_seed(8, 0)
+
+
+def test_policy_seeds_and_order_follow_from_the_salt() -> None:
+    episodes = [(name, pose, seed) for name in ("mug", "hammer") for pose in range(8) for seed in range(3)]
+    seeds = {salt: [policy_seed(salt, episode) for episode in episodes] for salt in ("0", "1")}
+    assert len({*seeds["0"], *seeds["1"]}) == 2 * len(episodes)
+    orders = {salt: shuffled(salt, episodes) for salt in ("0", "1")}
+    assert orders["0"] != orders["1"] != episodes and sorted(orders["0"]) == sorted(episodes)
+    some = episodes[::3]
+    assert shuffled("0", some) == [episode for episode in orders["0"] if episode in some]
+    assert len(check_salt(new_salt())) == 32 and new_salt() != new_salt()
+    for wrong in ("", "xyz", "A", "0" * 65, None):
+        with pytest.raises(InvalidInputError, match="hexadecimal"):
+            check_salt(wrong)
+
+
+class Recogniser:
+    """A policy that looks for its object's name in all that it is told before it moves: start, seed, place and order."""
+
+    control_mode = "pd_joint_delta_pos"
+
+    def __init__(self) -> None:
+        self.clues: list[dict[str, object]] = []
+        self.began = 0
+
+    def reset(self, num_envs: int, seed) -> None:
+        self.seeds = list(seed)
+        self.first = True
+
+    def act(self, observation):
+        count = len(observation["qpos"])
+        if self.first:
+            for env in range(count):
+                start = hashlib.sha256(b"".join(observation[key][env].tobytes() for key in sorted(observation)))
+                self.clues.append(
+                    {
+                        "start": start.hexdigest(),
+                        "seed": self.seeds[env],
+                        "low bits": self.seeds[env] % 64,
+                        "turn": self.began + env,
+                        "place": env,
+                        "start and turn": (start.hexdigest(), self.began + env),
+                    }
+                )
+            self.began += count
+            self.first = False
+        return np.zeros((count, NUM_JOINTS), dtype=np.float32)
+
+
+def test_a_policy_cannot_tell_which_object_it_holds(tmp_path, monkeypatch) -> None:
+    """It studies one evaluation with the answers, then guesses in another: no clue beats chance, which is one half."""
+    episodes = [(name, pose, seed) for name in ("phone", "cubelarge") for seed in (0, 1) for pose in range(8)]
+    runs = []
+    for salt in ("1", "2"):
+        recogniser = Recogniser()
+        monkeypatch.setattr(evaluation, "make_baseline", lambda *_, policy=recogniser: policy)
+        config = EvaluationConfig("random", ("phone", "cubelarge"), seeds=(0, 1), policy_salt=salt)
+        evaluation.explore(config, tmp_path / salt, lambda *_: None)
+        runs.append([(c, name) for c, (name, _, _) in zip(recogniser.clues, shuffled(salt, episodes), strict=True)])
+    studied, played = runs
+    for clue in studied[0][0]:
+        seen: dict[object, list[str]] = {}
+        for clues, name in studied:
+            seen.setdefault(clues[clue], []).append(name)
+        guesses = [
+            max(sorted(set(known)), key=known.count) if (known := seen.get(c[clue])) else "phone" for c, _ in played
+        ]
+        right = np.mean([guess == name for guess, (_, name) in zip(guesses, played, strict=True)])
+        assert right <= 0.5 + 2 * np.sqrt(0.25 / 32), f"{clue} tells the object: {right:.2f} right"
+    starts = {clues["start"] for clues, _ in [*studied, *played]}
+    assert len(starts) == 16  # one per pose and repetition, whatever the object
 
 
 def test_episode_is_complete_and_consistent(rollouts) -> None:
@@ -81,7 +156,7 @@ def test_replayed_actions_reproduce_the_grids_step_by_step(rollouts) -> None:
     rollout = rollouts[6]
     env = gym.make(ENVIRONMENT_ID, render_backend="none")
     try:
-        observation, _ = env.reset(seed=episode_seed("phone", 6, 0), options={"object": "phone", "pose": 6})
+        observation, _ = env.reset(seed=episode_seed(6, 0), options={"object": "phone", "pose": 6})
         first = np.full(rollout.touched.shape, -1)
         for step, action in enumerate(rollout.actions):
             observation, *_ = env.step(action)
@@ -118,33 +193,36 @@ def test_equal_arguments_give_equal_episodes_in_a_new_environment(rollouts) -> N
     env = gym.make(ENVIRONMENT_ID, render_backend="none")
     try:
         baseline = make_baseline("heuristic")
-        roll_out(env, baseline, "cubelarge", 1, 5)  # leaves no trace
-        again = roll_out(env, baseline, "phone", 3, 0)
-        other = roll_out(env, baseline, "phone", 3, 1)
+        roll_out(env, baseline, "cubelarge", 1, 5, SALT)  # leaves no trace
+        again = roll_out(env, baseline, "phone", 3, 0, SALT)
+        other = roll_out(env, baseline, "phone", 3, 1, SALT)
+        salted = roll_out(env, baseline, "phone", 3, 0, "beef")
     finally:
         env.close()
     assert np.array_equal(again.actions, rollouts[3].actions)
     assert np.array_equal(again.touched_step, rollouts[3].touched_step)
     assert again.episode_return == rollouts[3].episode_return
     assert not np.array_equal(other.actions, again.actions)
+    assert not np.array_equal(salted.actions, again.actions)
 
 
-@pytest.mark.parametrize("identifier", ["heuristic", "random", "learned"])
+@pytest.mark.parametrize("identifier", ["heuristic", "random", "random_targets", "learned"])
 def test_batches_of_episodes_are_bit_for_bit_those_of_gym_make(identifier: str) -> None:
     """The CPU vector environment that evaluation uses, against one ManiSkill environment; five episodes in threes."""
     torch.manual_seed(1)
     torch.set_num_threads(1)
     explorer = LearnedBaseline(build_policy(METADATA)) if identifier == "learned" else make_baseline(identifier)
     episodes = [("phone", 0, 0), ("cubelarge", 5, 0), ("phone", 3, 1), ("cubelarge", 2, 4), ("phone", 6, 0)]
-    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", processes=2)
-    batched = [r for first in (0, 3) for r in roll_out_batch(envs, explorer, episodes[first : first + 3])]
+    mode = explorer.control_mode
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", split="test", control_mode=mode, processes=2)
+    batched = [r for first in (0, 3) for r in roll_out_batch(envs, explorer, episodes[first : first + 3], SALT)]
     with pytest.raises(InvalidInputError, match="4 given for 3 environments"):
-        roll_out_batch(envs, explorer, episodes[:4])
+        roll_out_batch(envs, explorer, episodes[:4], SALT)
     envs.close()
-    env = gym.make(ENVIRONMENT_ID, render_backend="none")
+    env = gym.make(ENVIRONMENT_ID, control_mode=mode, render_backend="none")
     assert sum(rollout.touched.sum() for rollout in batched) > 0
     for rollout, episode in zip(batched, episodes, strict=True):
-        single = roll_out(env, explorer, *episode)
+        single = roll_out(env, explorer, *episode, SALT)
         for name, value in vars(single).items():
             assert np.array_equal(getattr(rollout, name), value), (episode, name)
     env.close()
@@ -153,7 +231,7 @@ def test_batches_of_episodes_are_bit_for_bit_those_of_gym_make(identifier: str) 
 def test_heuristic_touches_much_more_than_random(rollouts) -> None:
     env = gym.make(ENVIRONMENT_ID, render_backend="none")
     try:
-        random = [roll_out(env, make_baseline("random"), "phone", pose, 0).touched.sum() for pose in (0, 3, 6)]
+        random = [roll_out(env, make_baseline("random"), "phone", pose, 0, SALT).touched.sum() for pose in (0, 3, 6)]
     finally:
         env.close()
     assert np.mean([rollout.touched.sum() for rollout in rollouts]) > 3 * np.mean(random)
@@ -230,7 +308,7 @@ def test_episodes_of_other_assets_are_not_mixed(tmp_path: Path) -> None:
     folder = tmp_path / "rollouts" / "random"
     folder.mkdir(parents=True)
     (folder / "source.json").write_text(json.dumps({"baseline": "random", "asset_manifest_sha256": "another"}))
-    with pytest.raises(InvalidInputError, match="another model or of other assets"):
+    with pytest.raises(InvalidInputError, match=r"holds other episodes \(another model_sha256"):
         evaluate(config, {}, tmp_path)
 
 

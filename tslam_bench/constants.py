@@ -53,8 +53,48 @@ SIGNED_DISTANCE_TOLERANCE: Final = 0.5e-3
 """Largest error of a signed-distance field at the surface (m)."""
 
 # --- Section 8: objects ----------------------------------------------------------------------------------------
+DEFAULT_SPLIT: Final = "train"
+"""Split that environments draw from when none is asked for: who trains with the defaults does not train on the test set."""
+TRAIN_OBJECTS: Final = 626
+"""Objects of the default train split, as ``assets/manifest_train.json`` lists them."""
 QUICK_OBJECTS: Final = ("mug", "stanfordbunny", "toruslarge", "wineglass", "hammer")
 """Test objects of the quick run."""
+QUICK_TRAIN_OBJECTS: Final = (
+    "bottle-000",
+    "bowl-000",
+    "tumbler-000",
+    "goblet-000",
+    "mug-000",
+    "frying-pan-000",
+    "cooking-pot-000",
+    "teapot-000",
+    "plate-000",
+    "padlock-000",
+    "candlestick-000",
+    "mallet-000",
+    "screwdriver-000",
+    "spoon-000",
+    "wrench-000",
+    "paint-brush-000",
+    "key-000",
+    "comb-000",
+    "carton-000",
+    "spectacles-000",
+    "toaster-000",
+    "book-000",
+    "bangle-000",
+    "picture-frame-000",
+)
+"""Generated train objects of the quick set-up, by name: what else is prepared must not change its results."""
+QUICK_VAL_OBJECTS: Final = (
+    "bucket-000",
+    "mushroom-000",
+    "rocket-000",
+    "cogwheel-000",
+    "trophy-000",
+    "bench-000",
+)
+"""Generated val objects on which the quick run fixes thresholds."""
 REACHABLE_BALL_RADIUS: Final = 4e-3
 """Inner voids that a ball of this radius (m) cannot enter from outside count as solid. The thinnest fingertip has a radius of
 7 mm; the teapot's spout lets through balls of up to 3.8 mm."""

@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tslam_bench.constants import WORKSPACE_EDGE
+
 ARM_JOINTS: Final = ("ARTx", "ARTy", "ARTz", "ARRz")
 """Translation along the forearm frame's x (sideways), y (up), z (along the fingers), and roll about z."""
 WRIST_JOINTS: Final = ("WRJ1", "WRJ0")
@@ -70,12 +72,13 @@ DELTA_STEP: Final = _per_joint(0.04, 0.2, 0.25, 0.4)
 
 CONTROL_MODES: Final = ("pd_joint_delta_pos", "pd_joint_pos")
 
-START_ARM_LOW: Final = (-0.04, 0.0, -0.06, -0.2)
-START_ARM_HIGH: Final = (0.04, 0.17, 0.02, 0.2)
-"""Box from which an episode's arm qpos (ARTx, ARTy, ARTz, ARRz) is drawn: the open hand lies above the workspace centre."""
 START_CLEARANCE: Final = 0.045
-"""The draw of the height ARTy is restricted to this far (m) above the object's bounding box: room for the palm, the noise of the
-fingers and the roll. The start thus tells of the object only that it is not where the hand is, as touch would."""
+"""An open hand is clear of an object this far (m) below ARTy: room for the palm, the noise of the fingers and the roll."""
+_START_HEIGHT = WORKSPACE_EDGE / 2 + START_CLEARANCE
+START_ARM_LOW: Final = (-0.04, _START_HEIGHT, -0.06, -0.2)
+START_ARM_HIGH: Final = (0.04, _START_HEIGHT + 0.02, 0.02, 0.2)
+"""Box from which an episode's arm qpos (ARTx, ARTy, ARTz, ARRz) is drawn. The open hand lies above the workspace, hence
+above the tallest object that the gates allow: one box for all objects, so that the start tells nothing of them."""
 START_FINGER_NOISE: Final = 0.05
 """Finger and wrist joints start at their open value plus uniform noise in +-this (rad), clipped to the limits."""
 

@@ -29,7 +29,7 @@ def make_vec(
     *,
     object: str | None = None,
     objects: Sequence[str] | None = None,
-    split: str = "test",
+    split: str | None = None,
     pose: int | None = None,
     reward_mode: str = "tslam",
     control_mode: str = "pd_joint_delta_pos",
@@ -48,7 +48,8 @@ def make_vec(
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         object: one object for every episode.
         objects: names to draw from, one draw per episode; neither means the whole split.
-        split: ``test``, ``train`` or ``val``.
+        split: ``test``, ``train``, ``val`` or a private split; None: named objects are found in whatever split has them, and
+            without names episodes draw from what is prepared of ``train``.
         pose: one of the environment's poses for every episode; None draws.
         reward_mode: see the environment.
         control_mode: see the environment.

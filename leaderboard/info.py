@@ -12,6 +12,7 @@ from typing import Any, Final, Literal
 
 from tslam_bench.constants import ENVIRONMENT_ID, PRIVILEGED_REWARD_MODES, PROTOCOL_VERSION, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.hand_constants import CONTROL_MODES
 
 SCHEMA_VERSION: Final = 1
 """Version of the submission format."""
@@ -22,6 +23,9 @@ PRIVILEGED_EXPLORERS: Final = ("tslam_chamfer", "oracle")
 
 _IDENTIFIER = re.compile(r"[a-z0-9][a-z0-9_.-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_SALT = re.compile(r"[0-9a-fA-F]{1,64}")
+_STATED = ("schema_version", "protocol_version", "environment_id", "control_mode", "policy_salt")
+"""Fields that have a default for who writes a submission; a file has to state them."""
 _MAX_TEXT = 300
 _MAX_SEED = 2**31 - 1
 
@@ -55,6 +59,9 @@ class SubmissionInfo:
         object_set: ``"quick"`` or ``"test"``: submissions are ranked within one set.
         privileged: anything the policy saw or was rewarded with derives from the true mesh.
         reward_mode: reward the policy was trained with (``REWARD_MODES``), or None for another or no reward.
+        control_mode: mode (``CONTROL_MODES``) that the rollouts' actions are of.
+        policy_salt: 1 to 64 hexadecimal digits that salt the benchmark's stream of random numbers for policies
+            (``tslam_bench.episodes``), or None if the policy's random numbers did not come from that stream.
         training: budget and hardware.
         label: a remark shown beside every figure, such as "quick run: 4,000 steps, proves the path".
         contact: how to reach the authors; may be empty.
@@ -74,6 +81,8 @@ class SubmissionInfo:
     privileged: bool
     package_version: str
     reward_mode: str | None = None
+    control_mode: str = "pd_joint_delta_pos"
+    policy_salt: str | None = None
     training: Training = field(default_factory=Training)
     label: str = ""
     contact: str = ""
@@ -124,6 +133,10 @@ class SubmissionInfo:
             raise InvalidInputError(
                 f"reward_mode {self.reward_mode!r}: choose null or one of {', '.join(REWARD_MODES)}"
             )
+        if self.control_mode not in CONTROL_MODES:
+            raise InvalidInputError(f"control_mode {self.control_mode!r}: choose one of {', '.join(CONTROL_MODES)}")
+        if self.policy_salt is not None and not _SALT.fullmatch(_text(self.policy_salt, "policy_salt")):
+            raise InvalidInputError("policy_salt: expected 1 to 64 hexadecimal digits, or null")
         if not isinstance(self.training, Training):
             raise InvalidInputError("training: expected an object with steps, wall_time_hours and hardware")
         _integer(self.training.steps, "training.steps", 0)
@@ -146,7 +159,8 @@ class SubmissionInfo:
     def identity(self) -> tuple[object, ...]:
         """What must not change when a submission is resumed."""
         names = ("method", "explorer", "reconstructor", "object_set", "environment_id", "protocol_version")
-        return tuple(getattr(self, n) for n in (*names, "asset_manifest_sha256", "privileged", "reward_mode"))
+        names += ("asset_manifest_sha256", "privileged", "reward_mode", "control_mode", "policy_salt")
+        return tuple(getattr(self, n) for n in names)
 
 
 def parse_info(text: bytes) -> SubmissionInfo:
@@ -175,8 +189,7 @@ def _build(kind: type, values: Any, prefix: str) -> Any:
             raise InvalidInputError(f"unknown field {prefix}{name[:60]!r}; {remedy}")
     for name, f in fields.items():
         required = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        # The versions have defaults for who writes a submission; a file has to state them.
-        if name not in values and (required or name in ("schema_version", "protocol_version", "environment_id")):
+        if name not in values and (required or name in _STATED):
             raise InvalidInputError(f"field {prefix}{name} is missing; see docs/submission.md for the format")
     read = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     if "training" in read:

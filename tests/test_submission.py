@@ -41,6 +41,7 @@ INFO = SubmissionInfo(
     package_version=__version__,
     training=Training(4000, 0.5, "2 cores"),
     label="quick run",
+    policy_salt="0123456789abcdef",
 )
 ROLLOUT = "rollouts/mug/pose3_seed7.npz"
 VOLUME = "reconstructions/mug_8_seed0.npz"
@@ -131,8 +132,10 @@ def test_names_of_the_protocol() -> None:
     assert set(RECONSTRUCTED_POSES) == {1, 2, 4, 8}
 
 
-def test_json_round_trip() -> None:
-    assert parse_info(json.dumps(INFO.to_json()).encode()) == INFO
+@pytest.mark.parametrize("changes", [{}, {"control_mode": "pd_joint_pos", "policy_salt": None}])
+def test_json_round_trip(changes: dict) -> None:
+    info = replace(INFO, **changes)
+    assert parse_info(json.dumps(info.to_json()).encode()) == info
 
 
 # --- Writing ---------------------------------------------------------------------------------------------------
@@ -156,9 +159,13 @@ def test_a_failing_block_leaves_no_submission(tmp_path: Path) -> None:
     assert not (tmp_path / "sub" / "submission.json").exists()
 
 
-def test_another_submission_is_not_overwritten(folder: Path) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [{"explorer": "heuristic"}, {"control_mode": "pd_joint_pos"}, {"policy_salt": "00"}, {"policy_salt": None}],
+)
+def test_another_submission_is_not_overwritten(folder: Path, change: dict) -> None:
     with pytest.raises(InvalidInputError, match="holds another submission"):
-        SubmissionWriter(folder, replace(INFO, explorer="heuristic"))
+        SubmissionWriter(folder, replace(INFO, **change))
 
 
 @pytest.mark.parametrize(
@@ -223,6 +230,13 @@ def test_bad_places_are_not_written(tmp_path: Path) -> None:
         ({"privileged": "no"}, ["privileged is 'no'"]),
         ({"reward_mode": "tslamm"}, ["reward_mode 'tslamm'"]),
         ({"reward_mode": ["tslam"]}, ["reward_mode"]),
+        ({"control_mode": "pd_joint_vel"}, ["control_mode 'pd_joint_vel'", "pd_joint_delta_pos, pd_joint_pos"]),
+        ({"control_mode": None}, ["control_mode None"]),
+        ({"control_mode": ["pd_joint_pos"]}, ["control_mode"]),
+        ({"policy_salt": ""}, ["policy_salt", "hexadecimal"]),
+        ({"policy_salt": "pepper"}, ["policy_salt", "hexadecimal"]),
+        ({"policy_salt": "0" * 65}, ["policy_salt", "1 to 64"]),
+        ({"policy_salt": 7}, ["policy_salt is 7", "text"]),
         ({"link": "javascript:alert(1)"}, ["link", "http(s)"]),
         ({"asset_manifest_sha256": "abc"}, ["asset_manifest_sha256"]),
         ({"training": []}, ["training"]),
@@ -241,7 +255,13 @@ def test_bad_info_is_refused(folder: Path, changes: dict, fragments: list[str]) 
     refused(folder, "submission.json", *fragments)
 
 
-@pytest.mark.parametrize("field", ["method", "authors", "seeds", "privileged", "schema_version", "environment_id"])
+@pytest.mark.parametrize(
+    "field",
+    [
+        *("method", "authors", "seeds", "privileged", "schema_version", "environment_id"),
+        *("control_mode", "policy_salt"),
+    ],
+)
 def test_missing_fields_are_refused(folder: Path, field: str) -> None:
     (folder / "submission.json").write_text(json.dumps({k: v for k, v in INFO.to_json().items() if k != field}))
     refused(folder, f"field {field} is missing")

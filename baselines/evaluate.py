@@ -30,6 +30,7 @@ from tslam_bench.episodes import check_salt, new_salt, shuffled
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
 from tslam_bench.grids import merge, world_to_object
+from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.leaderboard.info import SubmissionInfo, Training
 from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, SubmissionWriter
 from tslam_bench.reconstruction.registry import make_reconstructor
@@ -251,6 +252,8 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
         privileged=spec.privileged,
         package_version=tslam_bench.__version__,
         reward_mode=spec.reward_mode,
+        control_mode=source.get("control_mode", CONTROL_MODES[0]),
+        policy_salt=source.get("policy_salt"),
         training=training,
         label=config.label,
     )

@@ -220,7 +220,8 @@ def test_batches_of_episodes_are_bit_for_bit_those_of_gym_make(identifier: str) 
         roll_out_batch(envs, explorer, episodes[:4], SALT)
     envs.close()
     env = gym.make(ENVIRONMENT_ID, control_mode=mode, render_backend="none")
-    assert sum(rollout.touched.sum() for rollout in batched) > 0
+    if identifier != "random":  # which hardly ever gets down to the object
+        assert sum(rollout.touched.sum() for rollout in batched) > 0
     for rollout, episode in zip(batched, episodes, strict=True):
         single = roll_out(env, explorer, *episode, SALT)
         for name, value in vars(single).items():
@@ -271,7 +272,7 @@ def test_submissions_are_readable_and_resumed(tmp_path: Path) -> None:
     with pytest.raises(Killed):
         evaluate(config, reconstructors, tmp_path, kill)
     folder = tmp_path / "rollouts" / "heuristic"
-    kept = episode_path(folder, "phone", 1, 0)
+    kept = sorted(folder.rglob("*.npz"))[0]  # which three were played depends on the salt
     stamp = kept.stat().st_mtime_ns
     stages: list[tuple[str, int, int]] = []
     submissions = evaluate(config, reconstructors, tmp_path, lambda *event: stages.append(event))
@@ -279,6 +280,8 @@ def test_submissions_are_readable_and_resumed(tmp_path: Path) -> None:
     assert [path.name for path in submissions] == ["heuristic-grid", "heuristic-hull"]
 
     grid, hull = (read_submission(path) for path in submissions)
+    source = json.loads((folder / "source.json").read_text())
+    assert grid.info.policy_salt == source["policy_salt"] and grid.info.control_mode == "pd_joint_delta_pos"
     assert grid.info.label == "a label" and grid.info.explorer == "heuristic" and not grid.info.privileged
     rollouts = {pose: Rollout.load(episode_path(folder, "phone", pose, 0)) for pose in range(8)}
     for pose, rollout in rollouts.items():
@@ -308,7 +311,7 @@ def test_episodes_of_other_assets_are_not_mixed(tmp_path: Path) -> None:
     folder = tmp_path / "rollouts" / "random"
     folder.mkdir(parents=True)
     (folder / "source.json").write_text(json.dumps({"baseline": "random", "asset_manifest_sha256": "another"}))
-    with pytest.raises(InvalidInputError, match=r"holds other episodes \(another model_sha256"):
+    with pytest.raises(InvalidInputError, match=r"holds other episodes \(another .*asset_manifest_sha256"):
         evaluate(config, {}, tmp_path)
 
 

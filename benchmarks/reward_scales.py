@@ -1,72 +1,93 @@
-"""Episode sums of the reward terms under the random policy: where lambda and the mode scales come from (protocol section 7).
+"""Episode sums of the reward terms under random policies: where lambda and the mode scales come from (protocol section 7).
 
-python benchmarks/reward_scales.py --episodes-per-object 8
+    python benchmarks/reward_scales.py --document docs/rewards.md
+
+The policy that decides is ``random_targets``. Uniform actions (``random``) are shown beside it; they hardly reach the object.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
-import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
+from report import machine, markdown_table, print_table, replace_section, write_json
 from tqdm import tqdm
 
-import tslam_bench  # noqa: F401  (registers the environment)
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, NUM_POSES, QUICK_OBJECTS, REWARD_MODES
+import tslam_bench
+from tslam_bench.baselines.registry import make_baseline
+from tslam_bench.baselines.rollout import roll_out_batch
+from tslam_bench.constants import ENVIRONMENT_ID, NUM_POSES, QUICK_TRAIN_OBJECTS, REWARD_MODES
 from tslam_bench.tasks.rewards import COVERAGE_WEIGHT, MODE_SCALE
+
+SALT = "0"
+POLICIES = ("random_targets", "random")
 
 
 @dataclass(frozen=True)
 class Config:
     """Measures the terms of every reward mode."""
 
-    objects: tuple[str, ...] = QUICK_OBJECTS
-    """Test objects to explore."""
-    episodes_per_object: int = NUM_POSES
-    """Episodes per object; episode k uses pose k % 8 and seed k."""
+    objects: tuple[str, ...] = QUICK_TRAIN_OBJECTS
+    """Train objects to explore."""
+    poses: int = 2
+    """Episodes per object; episode k is in pose (3 k) mod 8."""
+    processes: int | None = None
+    """Worker processes; default: the cores."""
+    output: Path | None = None
+    """JSON file for the figures."""
+    document: Path | None = None
+    """Page whose section ``scales`` is replaced by the table."""
 
 
-def episode_sums(config: Config, mode: str) -> tuple[float, float]:
+def episode_sums(config: Config, mode: str, policy: str) -> tuple[float, float]:
     """Mean episode sums of (the unscaled exploration term, newly visited voxels) in one reward mode."""
-    environment = gym.make(ENVIRONMENT_ID, objects=config.objects, reward_mode=mode)
+    explorer = make_baseline(policy)
+    environments = tslam_bench.make_vec(
+        ENVIRONMENT_ID,
+        len(config.objects),
+        "cpu",
+        objects=config.objects,
+        split="train",
+        reward_mode=mode,
+        control_mode=explorer.control_mode,
+        processes=config.processes,
+    )
     exploration, visited = [], []
-    for name in config.objects:
-        for episode in range(config.episodes_per_object):
-            generator = np.random.Generator(np.random.PCG64(episode))
-            environment.reset(seed=episode, options={"object": name, "pose": episode % NUM_POSES})
-            total, new = 0.0, 0
-            for _ in range(HORIZON):
-                action = generator.uniform(-1, 1, NUM_JOINTS).astype(np.float32)
-                _, reward, _, _, info = environment.step(action)
-                total += float(reward)
-                new += int(info["new_visited"])
-            coverage = 0.0 if mode == "no_coverage" else COVERAGE_WEIGHT * new
-            exploration.append((total - coverage) / MODE_SCALE[mode])
-            visited.append(new)
-    environment.close()
+    try:
+        for index in range(config.poses):
+            episodes = [(name, 3 * index % NUM_POSES, 0) for name in config.objects]
+            for rollout in roll_out_batch(environments, explorer, episodes, SALT):
+                new = int(rollout.visited.sum())
+                coverage = 0.0 if mode == "no_coverage" else COVERAGE_WEIGHT * new
+                exploration.append((rollout.episode_return - coverage) / MODE_SCALE[mode])
+                visited.append(new)
+    finally:
+        environments.close()
     return float(np.mean(exploration)), float(np.mean(visited))
 
 
 def main(config: Config) -> None:
-    """Prints one row per mode."""
-    torch.set_num_threads(1)
-    table = Table(
-        "reward mode",
-        "exploration term",
-        "x scale",
-        "newly visited",
-        "x lambda",
-        title="mean episode sums, random policy",
-    )
-    for mode in tqdm(REWARD_MODES, desc="modes"):
-        exploration, visited = episode_sums(config, mode)
-        numbers = (exploration, exploration * MODE_SCALE[mode], visited, visited * COVERAGE_WEIGHT)
-        table.add_row(mode, *(f"{number:.4g}" for number in numbers))
-    Console().print(table)
+    """Prints one row per policy and mode."""
+    header = ("policy", "reward mode", "exploration term", "x scale", "newly visited voxels", "x lambda")
+    rows: list[tuple[str, ...]] = []
+    result: list[dict[str, Any]] = []
+    for policy in POLICIES:
+        for mode in tqdm(REWARD_MODES if policy == POLICIES[0] else ("tslam",), desc=policy):
+            if mode == "no_discovery":  # it has no exploration term
+                continue
+            exploration, visited = episode_sums(config, mode, policy)
+            result.append({"policy": policy, "mode": mode, "exploration": exploration, "visited": visited})
+            numbers = (exploration, exploration * MODE_SCALE[mode], visited, visited * COVERAGE_WEIGHT)
+            rows.append((f"`{policy}`", f"`{mode}`", *(f"{number:.4g}" for number in numbers)))
+    print_table(header, rows)
+    write_json(config.output, result)
+    if config.document is not None:
+        episodes = config.poses * len(config.objects)
+        text = f"{machine()}; mean of {episodes} episodes on {len(config.objects)} train objects.\n\n"
+        replace_section(config.document, "scales", text + markdown_table(header, rows))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from tslam_bench.baselines.jobs import Job, JobRunner
 from tslam_bench.baselines.registry import get_baseline, list_baselines
 from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
 from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
+from tslam_bench.episodes import check_salt
 from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.leaderboard.submission import INFO_FILE
 from tslam_bench.reconstruction.registry import get_reconstructor
@@ -37,7 +38,7 @@ ALL_BASELINES: Final = tuple(spec.id for spec in list_baselines())
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a run does; :data:`PRESETS` has the three usual ones.
+    """What a run does; :data:`PRESETS` has the usual ones.
 
     Attributes:
         name: folder below the output folder, and label.
@@ -52,6 +53,8 @@ class RunSettings:
         reconstructors: ids; learned ones are trained first.
         reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
         remark: shown beside the figures of learned baselines.
+        policy_salt: where explorers' random numbers and the order of episodes come from. Ours do not look at it, so it is fixed:
+            a run gives the same figures everywhere.
     """
 
     name: str
@@ -65,6 +68,7 @@ class RunSettings:
     reconstructors: tuple[str, ...]
     reconstruction_training: tuple[str, ...]
     remark: str
+    policy_salt: str = "2021"
 
 
 _SMALL_TRAINING: Final = (
@@ -109,6 +113,19 @@ PRESETS: Final[dict[str, RunSettings]] = {
         reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
         remark="shows that everything runs, nothing else",
     ),
+    "scripted": RunSettings(
+        name="scripted",
+        objects=(),
+        object_set="test",
+        baselines=("random", "random_targets", "heuristic", "oracle", "nothing"),
+        seeds=(0, 1, 2),
+        steps=0,
+        training=(),
+        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
+        reconstructors=("grid", "hull", "carve", "ifnet"),
+        reconstruction_training=("--steps", "1000"),
+        remark="",
+    ),
     "full": RunSettings(
         name="full",
         objects=(),
@@ -123,22 +140,24 @@ PRESETS: Final[dict[str, RunSettings]] = {
         remark="",
     ),
 }
-"""``quick``: a leaderboard within 15 minutes on 2 cores. ``tiny``: the same path in a minute or two, for CI. ``full``: the
-protocol's objects and the paper's budget; days on a CPU."""
+"""``quick``: a leaderboard within 15 minutes on 2 cores. ``tiny``: the same path in a minute or two, for CI. ``scripted``: what
+needs no policy to be trained, on all test objects, three seeds. ``full``: everything, with the paper's budget; days on a CPU."""
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Runs the whole benchmark: assets, training, episodes, reconstruction, scores and page.
 
-    Choose one of --quick, --tiny and --full; the other flags change it. Run the same command again to go on after a stop;
-    what is there is reused.
+    Choose one of --quick, --tiny, --scripted and --full; the other flags change it. Run the same command again to go on after
+    a stop; what is there is reused.
     """
 
     quick: bool = False
     """Five objects, all baselines, a few thousand training steps: 15 minutes on 2 cores."""
     tiny: bool = False
     """One object, five explorers, hardly any training: checks that the path works."""
+    scripted: bool = False
+    """The whole test split, three seeds, the explorers that are not trained: about an hour on 2 cores."""
     full: bool = False
     """The whole test split, three seeds, the paper's training budget: days on a CPU."""
     objects: tuple[str, ...] | None = None
@@ -151,6 +170,8 @@ class Arguments:
     """Training steps of each learned baseline instead of the preset's."""
     reconstructors: tuple[str, ...] | None = None
     """Reconstructors instead of the preset's (tslam-bench reconstruct list)."""
+    policy_salt: str | None = None
+    """Hexadecimal digits that explorers' random numbers come from, instead of the preset's."""
     output: Path | None = None
     """Folder of the run; default: runs/ and the preset's name."""
     workers: int = os.cpu_count() or 2
@@ -167,16 +188,17 @@ def settings_of(arguments: Arguments) -> RunSettings:
     """
     chosen = [name for name in PRESETS if getattr(arguments, name)]
     if len(chosen) != 1:
-        raise InvalidInputError("choose one of --quick, --tiny and --full (--help tells more)")
+        raise InvalidInputError("choose one of --quick, --tiny, --scripted and --full (--help tells more)")
     changes = {
         name: getattr(arguments, name)
-        for name in ("objects", "baselines", "seeds", "steps", "reconstructors")
+        for name in ("objects", "baselines", "seeds", "steps", "reconstructors", "policy_salt")
         if getattr(arguments, name) is not None
     }
     for name, value in changes.items():
         if value in ((), 0):
             raise InvalidInputError(f"--{name}: give at least one")
     settings = replace(PRESETS[chosen[0]], **changes)
+    check_salt(settings.policy_salt)
     for baseline in settings.baselines:
         get_baseline(baseline)
     for reconstructor in settings.reconstructors:
@@ -287,6 +309,8 @@ def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
         specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
         command: Command = ("tslam-bench", "baselines", "evaluate", name, "--object-set", settings.object_set)
         command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
+        if kind != "reference":
+            command += ("--policy-salt", settings.policy_salt)
         command += ("--reconstructors", *specifications, *_ONE_PROCESS, "--output", str(output))
         after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
         if any(get_reconstructor(r).needs == "objects" for r in chosen):

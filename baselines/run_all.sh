@@ -6,13 +6,14 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 for argument in "$@"; do
     if [ "$argument" = "-h" ] || [ "$argument" = "--help" ]; then
         cat <<'USAGE'
-usage: bash baselines/run_all.sh --quick | --tiny | --full [options]
+usage: bash baselines/run_all.sh --quick | --tiny | --scripted | --full [options]
 
 Does its own set-up (virtual environment, dependencies, assets), prints the commands it runs, and leaves
 runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run it again to go on after a stop.
 
   --quick                five objects, all baselines, a few thousand training steps: 15 minutes on 2 cores
   --tiny                 one object, five explorers, hardly any training: checks that the path works
+  --scripted             the whole test split, three seeds, explorers that are not trained: about an hour on 2 cores
   --full                 the whole test split, three seeds, the paper's training budget: days on a CPU
 
   --objects NAME ...     test objects instead of the preset's
@@ -21,6 +22,7 @@ runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run i
   --steps N              training steps of each learned baseline
   --reconstructors ID ...
                          reconstructors instead of the preset's (tslam-bench reconstruct list)
+  --policy-salt DIGITS   hexadecimal digits that explorers' random numbers come from
   --output FOLDER        folder of the run (default: runs/ and the preset's name)
   --workers N            processes at a time (default: the cores)
   --dry-run              print the commands without running them

@@ -70,7 +70,7 @@ def explore(config: Config) -> tuple[trimesh.Trimesh, np.ndarray, np.ndarray]:
     explorer = make_baseline(config.baseline)
     touched, visited, best, moment = [], [], -1, None
     for pose in tqdm(range(NUM_POSES), desc="poses"):
-        seed = episode_seed(config.object, pose, config.seed)
+        seed = episode_seed(pose, config.seed)
         observation, _ = environment.reset(seed=seed, options={"pose": pose})
         explorer.reset(1, seed)
         for _ in range(HORIZON):

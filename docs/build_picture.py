@@ -66,8 +66,8 @@ def hand_mesh(environment: Any) -> trimesh.Trimesh:
 
 def explore(config: Config) -> tuple[trimesh.Trimesh, np.ndarray, np.ndarray]:
     """The hand at the moment of pose 0 when most links touch; merged touched and visited grids (object frame)."""
-    environment = gym.make(ENVIRONMENT_ID, object=config.object)
     explorer = make_baseline(config.baseline)
+    environment = gym.make(ENVIRONMENT_ID, object=config.object, control_mode=explorer.control_mode)
     touched, visited, best, moment = [], [], -1, None
     for pose in tqdm(range(NUM_POSES), desc="poses"):
         seed = episode_seed(pose, config.seed)

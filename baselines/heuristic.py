@@ -1,13 +1,14 @@
 """``heuristic``: a power grasp closing from a randomly placed open hand, reopened and repeated (protocol section 11).
 
-Blind: it reads joint positions only, and takes an arm that no longer sinks for an obstacle. Each grasp has four phases:
+Blind: it reads joint positions and the palm's touch bits, nothing else. It goes from spot to spot. At each of them:
 
-* travel: the open hand moves to a random spot at a safe height;
-* sink: it comes down, palm first, until something stops it or it is at the spot's depth;
-* close: all fingers and the thumb flex;
-* open: they reopen and the hand rises, then the next grasp begins.
+* travel: the open hand moves over a random spot at a safe height;
+* sink: it comes down, palm first, until the palm feels something, the arm is stopped, or it is at the spot's depth;
+* close: fingers and thumb flex, each by a random share of its range;
+* open: they reopen and the hand rises a little.
 
-All episodes of a batch advance together; phases are arrays, so there is no loop over episodes.
+Close and open are repeated a few times with the arm shifted a little, then the next spot follows. All episodes of a batch
+advance together; phases are arrays, so there is no loop over episodes.
 """
 
 from __future__ import annotations
@@ -21,54 +22,77 @@ from numpy.typing import NDArray
 
 from tslam_bench.baselines.interface import check_observation, episode_generators
 from tslam_bench.constants import NUM_JOINTS
-from tslam_bench.hand_constants import CONTROL_MODES, DELTA_STEP, JOINT_LIMITS, JOINT_NAMES
+from tslam_bench.hand_constants import CONTROL_MODES, DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS
 
 _TRAVEL, _SINK, _CLOSE, _OPEN = range(4)
 _INDEX: Final = {name: index for index, name in enumerate(JOINT_NAMES)}
 _SIDE, _HEIGHT, _FORWARD, _ROLL = (_INDEX[name] for name in ("ARTx", "ARTy", "ARTz", "ARRz"))
-_SPREAD_JOINTS: Final = tuple(_INDEX[name] for name in ("FFJ3", "MFJ3", "RFJ3", "LFJ3"))
+_WRIST: Final = (_INDEX["WRJ1"], _INDEX["WRJ0"])
+_SPREAD: Final = tuple(_INDEX[f"{finger}J3"] for finger in ("FF", "MF", "RF", "LF"))
+_FINGERS: Final = tuple(tuple(_INDEX[f"{finger}J{k}"] for k in (2, 1, 0)) for finger in ("FF", "MF", "RF", "LF"))
+"""Knuckle, middle and end joint of each finger."""
+_THUMB: Final = tuple(_INDEX[f"THJ{k}"] for k in (4, 3, 2, 1, 0))
+_PALM: Final = tuple(SKIN_LINKS.index(link) for link in ("palm", "lfmetacarpal"))
 
-_OPEN_HAND: Final = {"THJ4": 0.0}
-"""Joint values of the open hand where they are not 0 (rad)."""
-_CLOSED_HAND: Final = {
-    **{f"{finger}J2": 1.4 for finger in ("FF", "MF", "RF", "LF")},
-    **{f"{finger}J1": 1.2 for finger in ("FF", "MF", "RF", "LF")},
-    **{f"{finger}J0": 1.4 for finger in ("FF", "MF", "RF", "LF")},
-    **{"LFJ4": 0.3, "THJ4": 1.0, "THJ3": 0.9, "THJ2": 0.2, "THJ1": 0.4, "THJ0": -0.8},
-}
-"""Joint values of the fist where they are not 0 (rad)."""
+_FAN: Final = np.array([-1, -1 / 3, 1 / 3, 1])
+"""How the four fingers spread, from the first to the little one."""
+_END_BY_MIDDLE: Final = 1.15
+"""The tendon flexes a finger's end joint this much more than its middle joint."""
+_OPPOSED: Final = np.array([1.0, 0.9, 0.2, 0.4, -1.0])
+"""Thumb joints THJ4..0 of the closed hand (rad)."""
+_THUMB_REST: Final = 0.3
+"""Share of ``_OPPOSED`` that the open hand's thumb root keeps."""
+_LITTLE_ROOT: Final = 0.3
+"""LFJ4 of the closed hand (rad)."""
 
 
 @dataclass(frozen=True)
 class GraspConfig:
-    """Numbers of the heuristic, chosen by touched voxels on eight training objects.
+    """Numbers of the heuristic, found by ``benchmarks/tune_heuristic.py`` on train objects.
 
     Attributes:
-        side, forward: half range of the spots, ARTx and ARTz (m).
-        roll: half range of the roll, ARRz (rad).
-        spread: half range of the finger spread (rad).
+        side, forward, forward_centre: half ranges of the spots, ARTx and ARTz, and the middle of the latter (m).
+        roll, spread, wrist: half ranges of the roll, of the fan of the fingers and of the wrist's tilts at a spot (rad).
         depth: (lowest, highest) height to sink to, ARTy (m).
-        rise: height gained before travelling to the next spot (m).
+        rise: height gained over where the hand was stopped, before it travels on (m).
         travel_height: travelling is never higher than this, ARTy (m).
         travel_steps, sink_steps: longest duration of a phase (control steps).
         close_steps, open_steps: duration of a phase (control steps).
+        squeezes: grasps at a spot.
+        shift, roll_shift: half ranges of the arm's moves (m) and turns (rad) between them.
+        press: depth below where it was stopped that the closing hand aims at (m).
+        knuckle, middle: flexion of a closed finger's first and second joint (rad).
+        curl: smallest share of it that a closing finger is given.
+        thumb: the same of the thumb.
+        opened: share of it that an open finger keeps.
         stall: an arm that sinks less than this in one step has met an obstacle (m).
-        grasps: spots drawn per episode; more than fit in it.
+        spots: drawn per episode; more than fit in it.
     """
 
-    side: float = 0.06
-    forward: float = 0.07
+    side: float = 0.05
+    forward: float = 0.06
+    forward_centre: float = -0.01
     roll: float = 0.6
     spread: float = 0.3
+    wrist: float = 0.1
     depth: tuple[float, float] = (-0.08, 0.0)
-    rise: float = 0.05
-    travel_height: float = 0.15
-    travel_steps: int = 12
-    sink_steps: int = 30
-    close_steps: int = 14
-    open_steps: int = 6
+    rise: float = 0.03
+    travel_height: float = 0.17
+    travel_steps: int = 8
+    sink_steps: int = 16
+    close_steps: int = 6
+    open_steps: int = 4
+    squeezes: int = 1
+    shift: float = 0.04
+    roll_shift: float = 0.4
+    press: float = 0.01
+    knuckle: float = 1.5
+    middle: float = 1.3
+    curl: float = 0.8
+    thumb: float = 0.3
+    opened: float = 0.1
     stall: float = 3e-3
-    grasps: int = 32
+    spots: int = 40
 
 
 class HeuristicBaseline:
@@ -78,67 +102,86 @@ class HeuristicBaseline:
 
     def __init__(self, config: GraspConfig | None = None) -> None:
         self.config = config or GraspConfig()
-        self._open = _hand(_OPEN_HAND)
-        self._closed = _hand(_CLOSED_HAND)
         self.reset(1, 0)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
         c = self.config
         generators = episode_generators(num_envs, seed)
-        unit = np.stack([generator.uniform(-1, 1, (c.grasps, 5)) for generator in generators])
+        unit = np.stack([generator.uniform(-1, 1, (c.spots, 7)) for generator in generators])
         middle, half = np.mean(c.depth), (c.depth[1] - c.depth[0]) / 2
-        # (num_envs, grasps, 5): ARTx, ARTz, ARRz, finger spread, depth
-        self._spots = unit * np.array([c.side, c.forward, c.roll, c.spread, half]) + np.array([0, 0, 0, 0, middle])
-        self._grasp = np.zeros(num_envs, dtype=np.int64)
+        scale = np.array([c.side, c.forward, c.roll, c.spread, half, c.wrist, c.wrist])
+        # (num_envs, spots, 7): ARTx, ARTz, ARRz, fan, depth, WRJ1, WRJ0
+        self._spots = unit * scale + np.array([0, c.forward_centre, 0, 0, middle, 0, 0])
+        # (num_envs, spots * squeezes, 9): curl of four fingers and the thumb in [0, 1]; moves ARTx, ARTz, ARRz, fan in [-1, 1]
+        grips = np.stack([generator.uniform(0, 1, (c.spots * c.squeezes, 9)) for generator in generators])
+        self._curls = grips[..., :5] * (1 - np.array([c.curl] * 4 + [c.thumb])) + np.array([c.curl] * 4 + [c.thumb])
+        self._shifts = (2 * grips[..., 5:] - 1) * np.array([c.shift, c.shift, c.roll_shift, c.spread / 2])
+        self._spot = np.zeros(num_envs, dtype=np.int64)
+        self._squeeze = np.zeros(num_envs, dtype=np.int64)
         self._phase = np.full(num_envs, _TRAVEL)
         self._phase_step = np.zeros(num_envs, dtype=np.int64)
-        self._safe_height = np.full(num_envs, c.travel_height)
+        self._stopped_at = np.full(num_envs, c.travel_height)
         self._last_height = np.full(num_envs, np.inf)
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
+        c = self.config
         qpos = np.asarray(check_observation(observation, len(self._phase)), dtype=np.float64)
-        self._advance(qpos)
+        self._advance(qpos, np.asarray(observation["touch"])[:, _PALM].any(axis=1))
         rows = np.arange(len(qpos))
-        side, forward, roll, spread, depth = self._spots[rows, self._grasp % self.config.grasps].T
-        closing = (self._phase == _CLOSE)[:, None]
-        goal = np.where(closing, self._closed, self._open)
-        goal[:, _SIDE], goal[:, _FORWARD], goal[:, _ROLL] = side, forward, roll
-        goal[:, _SPREAD_JOINTS] += spread[:, None] * np.array([-1, -1 / 3, 1 / 3, 1])
-        high = (self._phase == _TRAVEL) | (self._phase == _OPEN)
-        goal[:, _HEIGHT] = np.where(high, self._safe_height, depth)
+        side, forward, roll, fan, depth, *wrist = self._spots[rows, self._spot % c.spots].T
+        grip = (self._spot * c.squeezes + self._squeeze) % (c.spots * c.squeezes)
+        gripping = self._phase >= _CLOSE
+        shift = np.where(gripping[:, None], self._shifts[rows, grip], 0.0)
+        goal = self._hand(self._phase == _CLOSE, self._curls[rows, grip])
+        goal[:, _SIDE], goal[:, _FORWARD] = side + shift[:, 0], forward + shift[:, 1]
+        goal[:, _ROLL] = roll + shift[:, 2]
+        goal[:, _WRIST] = np.stack(wrist, axis=1)
+        goal[:, _SPREAD] += (fan + shift[:, 3])[:, None] * _FAN
+        safe = np.minimum(self._stopped_at + c.rise, c.travel_height)
+        heights = [safe, depth, self._stopped_at - c.press, self._stopped_at + c.rise / 2]
+        goal[:, _HEIGHT] = np.select([self._phase == phase for phase in (_TRAVEL, _SINK, _CLOSE, _OPEN)], heights)
         goal = np.clip(goal, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
         return np.clip((goal - qpos) / DELTA_STEP, -1, 1).astype(np.float32)
 
-    def _advance(self, qpos: NDArray[np.float64]) -> None:
-        """Moves episodes whose phase is over to the next one."""
+    def _hand(self, closing: NDArray[np.bool_], curls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 28) goals of fingers and thumb: closed by ``curls`` (n, 5), or open."""
         c = self.config
-        rows = np.arange(len(qpos))
-        side, forward, _, _, depth = self._spots[rows, self._grasp % c.grasps].T
+        goal = np.zeros((len(closing), NUM_JOINTS))
+        flexed = np.where(closing[:, None], curls, [c.opened] * 4 + [0.0])
+        for finger, (knuckle, middle, end) in enumerate(_FINGERS):
+            goal[:, knuckle] = c.knuckle * flexed[:, finger]
+            goal[:, middle] = c.middle * flexed[:, finger]
+            goal[:, end] = _END_BY_MIDDLE * c.middle * flexed[:, finger]
+        goal[:, _THUMB] = flexed[:, 4:] * _OPPOSED
+        goal[:, _THUMB[:2]] = np.maximum(goal[:, _THUMB[:2]], _THUMB_REST * _OPPOSED[:2])
+        goal[:, _INDEX["LFJ4"]] = _LITTLE_ROOT * flexed[:, 4]
+        return goal
+
+    def _advance(self, qpos: NDArray[np.float64], felt: NDArray[np.bool_]) -> None:
+        """Moves episodes whose phase is over to the next one; ``felt`` (n,) says whose palm touches."""
+        c = self.config
+        side, forward, _, _, depth, *_ = self._spots[np.arange(len(qpos)), self._spot % c.spots].T
         height = qpos[:, _HEIGHT]
-        there = np.hypot(qpos[:, _SIDE] - side, qpos[:, _FORWARD] - forward) < 0.01
-        stopped = (self._last_height - height < c.stall) & (self._phase_step >= 4)
+        there = np.hypot(qpos[:, _SIDE] - side, qpos[:, _FORWARD] - forward) < 0.015
+        stalled = (self._last_height - height < c.stall) & (self._phase_step >= 3)
         over = np.select(
             [self._phase == _TRAVEL, self._phase == _SINK, self._phase == _CLOSE],
             [
                 there | (self._phase_step >= c.travel_steps),
-                stopped | (height <= depth + 0.005) | (self._phase_step >= c.sink_steps),
+                felt | stalled | (height <= depth + 0.005) | (self._phase_step >= c.sink_steps),
                 self._phase_step >= c.close_steps,
             ],
             self._phase_step >= c.open_steps,
         )
-        landed = over & (self._phase == _SINK)
-        self._safe_height = np.where(landed, np.minimum(height + c.rise, c.travel_height), self._safe_height)
-        self._grasp += over & (self._phase == _OPEN)
-        self._phase = np.where(over, (self._phase + 1) % 4, self._phase)
+        self._stopped_at = np.where(over & (self._phase == _SINK), height, self._stopped_at)
+        opened = over & (self._phase == _OPEN)
+        self._squeeze += opened
+        leaving = opened & (self._squeeze >= c.squeezes)
+        self._spot += leaving
+        self._squeeze[leaving] = 0
+        following = np.select([leaving, opened], [_TRAVEL, _CLOSE], self._phase + 1)
+        self._phase = np.where(over, following, self._phase)
         self._phase_step = np.where(over, 0, self._phase_step + 1)
         self._last_height = height.copy()
-
-
-def _hand(values: Mapping[str, float]) -> NDArray[np.float64]:
-    """(28,) joint values, 0 where none is given."""
-    hand = np.zeros(NUM_JOINTS)
-    for name, value in values.items():
-        hand[_INDEX[name]] = value
-    return hand

@@ -14,6 +14,7 @@ from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.baselines.interface import Baseline, episode_generators
 from tslam_bench.baselines.learned import LearnedBaseline, build_policy
 from tslam_bench.baselines.random_actions import RandomBaseline
+from tslam_bench.baselines.random_targets import RandomTargetsBaseline
 from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
 from tslam_bench.baselines.training_config import METADATA_FILE
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
@@ -60,6 +61,7 @@ def policy():
 def make(kind: str, policy) -> Baseline:
     makers = {
         "random": RandomBaseline,
+        "random_targets": RandomTargetsBaseline,
         "heuristic": HeuristicBaseline,
         "learned": lambda: LearnedBaseline(policy),
         "learned mean": lambda: LearnedBaseline(policy, deterministic=True),
@@ -149,7 +151,7 @@ def test_seeds_matter(kind: str, policy) -> None:
     assert not np.array_equal(one, other)
 
 
-@pytest.mark.parametrize("kind", ["random", "heuristic", "learned"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned"])
 def test_wrong_batch_is_refused(kind: str, policy) -> None:
     baseline = make(kind, policy)
     baseline.reset(2, 0)
@@ -179,6 +181,22 @@ def test_random_is_uniform_and_never_repeats() -> None:
     assert abs(actions.mean()) < 0.008 and abs(actions.var() - 1 / 3) < 0.004
     counts, _ = np.histogram(actions, bins=10, range=(-1, 1))
     assert np.abs(counts / actions.size - 0.1).max() < 0.005
+
+
+# -- random targets ----------------------------------------------------------------------------------------------------
+def test_random_targets_are_held_and_normal() -> None:
+    baseline = RandomTargetsBaseline()
+    baseline.reset(8, 4)
+    assert baseline.control_mode == "pd_joint_pos"
+    steps = 2 * HORIZON + 48
+    actions = np.stack([baseline.act(observation(start(8))) for _ in range(steps)])
+    held = actions.reshape(steps // 4, 4, 8, NUM_JOINTS)
+    assert (held == held[:, :1]).all() and len(np.unique(held[:, 0, 0, 0])) > 100
+    drawn = held[:, 0].reshape(-1)
+    inside = np.abs(drawn) < 1
+    # 25,088 draws: P(|x| < 1) = 0.9044 and P(|x| < 0.6) = 0.6827 for a normal of deviation 0.6; standard errors .002, .003
+    assert abs(inside.mean() - 0.9044) < 0.008 and abs((np.abs(drawn) < 0.6).mean() - 0.6827) < 0.012
+    assert abs(drawn.mean()) < 0.015 and np.abs(drawn).max() == 1
 
 
 # -- heuristic --------------------------------------------------------------------------------------------------------

@@ -90,6 +90,9 @@ def test_what_is_learned_from_is_named(tmp_path: Path) -> None:
         assert all(word.startswith("--") for word in command[first + len(names) : first + len(names) + 1])
     tiny = {job.name: job for job in plan(PRESETS["tiny"], tmp_path, 2)}["train-ifnet"].command
     assert "--threshold-split train --threshold-objects bottle-000" in shlex.join(tiny)
+    scripted = {job.name: shlex.join(job.command) for job in plan(PRESETS["scripted"], tmp_path, 2)}
+    assert "--seeds 0 1 2" in scripted["evaluate-heuristic"] and "--policy-salt 2021" in scripted["evaluate-heuristic"]
+    assert "--policy-salt" not in scripted["evaluate-oracle"] and not any("train-tslam" in name for name in scripted)
     for job in plan(PRESETS["full"], tmp_path, 2):
         assert (job.fingerprint is not None) == job.name.startswith("assets-")
 

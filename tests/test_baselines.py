@@ -128,7 +128,7 @@ def test_scripted_baselines_need_no_torch() -> None:
 
 
 # -- every policy -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", ["random", "heuristic", "learned", "learned mean"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned mean"])
 def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> None:
     first = moving_hand(make(kind, policy), [5, 6], 40)
     again = moving_hand(make(kind, policy), [5, 6], 40)
@@ -138,14 +138,14 @@ def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> Non
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("kind", ["random", "heuristic", "learned", "learned mean"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned mean"])
 def test_an_episode_does_not_depend_on_its_batch(kind: str, policy) -> None:
     together = moving_hand(make(kind, policy), [11, 12, 13], 60)
     alone = moving_hand(make(kind, policy), [12], 60)
     assert np.array_equal(np.stack(together)[:, 1], np.stack(alone)[:, 0])
 
 
-@pytest.mark.parametrize("kind", ["random", "heuristic", "learned"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned"])
 def test_seeds_matter(kind: str, policy) -> None:
     one, other = (np.stack(moving_hand(make(kind, policy), [seed], 30)) for seed in (1, 2))
     assert not np.array_equal(one, other)

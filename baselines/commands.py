@@ -120,7 +120,14 @@ def _train(arguments: list[str]) -> None:
     config.check()
     output = parsed.output or Path("runs/models") / config.baseline
     with tqdm(total=config.total_steps, unit="step", desc=f"train {config.baseline}", mininterval=1.0) as bar:
-        metadata = train(config, output, _command("train", arguments), lambda done: _to(bar, done))
+
+        def show(done: int, figures: dict[str, float]) -> None:
+            if figures:
+                values = (figures.get("episode/return", 0.0), figures.get("episode/touched_voxels", 0.0))
+                bar.set_postfix_str("return {:.0f}, {:.0f} voxels touched".format(*values), refresh=False)
+            _to(bar, done)
+
+        metadata = train(config, output, _command("train", arguments), show)
         _to(bar, metadata["steps"])
     print(f"{output}: {metadata['baseline']}, {metadata['steps']} steps in {metadata['seconds']:.0f} s")
 

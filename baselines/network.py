@@ -1,135 +1,207 @@
-"""The policy network of protocol section 11: six 3D convolutions on the grids, joined by the joint angles, then an MLP.
+"""Policy networks (protocol section 11): convolutions on the two grids, joined by joints, touch and time, then an MLP.
 
-Full-resolution 3D convolutions cost tens of milliseconds per sample on a CPU (87 ms forward and backward for 8
-channels), so the first layer strides: by 4 in ``small`` (0.5 ms) and by 2 in ``paper`` (3.4 ms).
+Two are registered in :data:`NETWORKS`. ``paper`` has the published shape: six 3D convolutions, then four linear layers.
+``fast`` is what a CPU trains: the grids are counted in blocks of 2^3 voxels, and three convolutions whose kernels do not
+overlap (kernel 2, stride 2) are plain matrix products, because the blocks are stored patch by patch.
+
+Every network first *encodes* observations into what a rollout buffer keeps, 8 KB of bytes for both grids, and computes
+policy and value from that.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.constants import GRID_SIZE, NUM_JOINTS
+from tslam_bench.hand_constants import JOINT_LIMITS, SKIN_LINKS
 
-GRID_KEY: Final = "occupancy"
-"""The observation entry that goes through the convolutions; all others are concatenated behind them."""
+GRIDS: Final = 2
+"""Touched and visited."""
+FLAT_SIZE: Final = 2 * NUM_JOINTS + 1 + len(SKIN_LINKS)
+"""Numbers beside the grids: joint positions and velocities, time, touch."""
+VELOCITY_SCALE: Final = 5.0
+"""Joint velocities (rad/s or m/s) are divided by it, which brings them to the order of 1."""
+COUNT_SCALE: Final = 0.25
+"""Factor on the number of voxels (0 to 8) that are set in a block."""
 
 
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes of the policy network.
+class Encoded(NamedTuple):
+    """Observations as a rollout buffer keeps them.
 
     Attributes:
-        channels: output channels of the six convolutions.
-        kernels: kernel edge of each, in voxels of its input.
-        strides: stride of each.
-        hidden: width of the MLP's hidden layers, for the policy and again for the value; with its output layer the MLP
-            has four layers.
-        log_std: initial log standard deviation of the Gaussian policy.
+        grid: (n, bytes) uint8, both grids.
+        flat: (n, FLAT_SIZE) float32, of the order of 1.
     """
 
-    channels: tuple[int, ...]
-    kernels: tuple[int, ...]
-    strides: tuple[int, ...]
-    hidden: tuple[int, ...]
-    log_std: float = -0.5
+    grid: Tensor
+    flat: Tensor
 
-    def __post_init__(self) -> None:
-        if not len(self.channels) == len(self.kernels) == len(self.strides):
-            raise InvalidInputError("network: channels, kernels and strides must have one entry per convolution")
+    def __getitem__(self, index: Tensor | slice) -> Encoded:  # type: ignore[override]
+        """Some of the observations."""
+        return Encoded(self.grid[index], self.flat[index])
 
 
-NETWORKS: Final[dict[str, NetworkConfig]] = {
-    "small": NetworkConfig((8, 8, 16, 16, 32, 32), (4, 3, 3, 3, 3, 3), (4, 1, 2, 1, 2, 1), (128, 128, 128)),
-    "paper": NetworkConfig((8, 8, 16, 16, 32, 32), (3, 3, 3, 3, 3, 3), (2, 1, 2, 1, 2, 1), (256, 256, 256)),
-}
-"""``small``: for trials on a laptop; ``paper``: for full budgets."""
+class PatchTrunk(nn.Module):
+    """Three convolutions with kernel 2 and stride 2 on the grids, counted in 16^3 blocks, as matrix products.
 
-
-class GridAndJointsExtractor(BaseFeaturesExtractor):
-    """Six 3D convolutions on the grids, concatenated with every other entry of the observation.
-
-    Entries are brought to the order of 1: joint positions by their limits to [-1, 1], joint velocities by
-    ``velocity_scale``.
+    A block's place on an axis is four bits, the highest saying in which half it lies. The blocks are stored by (x, y, z)'s
+    highest bits first, then by the next ones, and so on: the eight blocks under a kernel lie side by side, and so do the
+    eight outputs that the next layer's kernel covers.
 
     Args:
-        observation_space: dict with ``occupancy`` (2, 32, 32, 32) and flat entries of shape (k,).
-        channels, kernels, strides: see :class:`NetworkConfig`.
-        joint_limits: (28, 2) lower and upper limits of ``qpos`` (rad or m).
-        velocity_scale: velocities are divided by it (rad/s or m/s).
+        channels: outputs of the three layers.
     """
 
-    joint_middle: Tensor
-    joint_half_range: Tensor
+    _order: Tensor
+
+    def __init__(self, channels: tuple[int, int, int] = (8, 32, 32)) -> None:
+        super().__init__()
+        self.out_features = 8 * channels[2]
+        widths = (8 * GRIDS, 8 * channels[0], 8 * channels[1])
+        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(widths, channels, strict=True))
+        self.register_buffer("_order", _patch_order(), persistent=False)
+
+    def encode(self, occupancy: Tensor) -> Tensor:
+        """(n, 2, 32, 32, 32) uint8 -> (n, 8192) uint8, voxels set in each block, patch by patch."""
+        pairs = occupancy[:, :, 0::2] + occupancy[:, :, 1::2]
+        pairs = (pairs[:, :, :, 0::2] + pairs[:, :, :, 1::2]).view(torch.int16)  # two neighbours along z per number
+        counts = (pairs + (pairs >> 8)).to(torch.uint8).flatten(1)
+        return torch.gather(counts, 1, self._order.expand(len(counts), -1))
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """(n, 8192) uint8 -> (n, out_features)."""
+        n, features = len(grid), grid.float() * COUNT_SCALE
+        for layer in self.layers:
+            features = torch.relu(layer(features.view(-1, layer.in_features)))
+        return features.view(n, -1)
+
+
+class ConvolutionTrunk(nn.Module):
+    """3D convolutions on the full grids.
+
+    Args:
+        channels: outputs of each convolution.
+        kernels: edge of each kernel, in voxels of its input.
+        strides: stride of each.
+    """
 
     def __init__(
         self,
-        observation_space: spaces.Dict,
-        channels: tuple[int, ...],
-        kernels: tuple[int, ...],
-        strides: tuple[int, ...],
-        joint_limits: tuple[tuple[float, float], ...],
-        velocity_scale: float = 5.0,
+        channels: tuple[int, ...] = (8, 8, 16, 16, 32, 32),
+        kernels: tuple[int, ...] = (3, 3, 3, 3, 3, 3),
+        strides: tuple[int, ...] = (2, 1, 2, 1, 2, 1),
     ) -> None:
-        if GRID_KEY not in observation_space.spaces:
-            raise InvalidInputError(f"observation space: has no {GRID_KEY!r}; use obs_mode='state_dict'")
-        grid_shape = observation_space[GRID_KEY].shape
-        assert grid_shape is not None
-        layers: list[nn.Module] = []
-        width = grid_shape[0]
-        for out, kernel, stride in zip(channels, kernels, strides, strict=True):
-            padding = (kernel - 1) // 2 if kernel % 2 else 0
-            convolution = nn.Conv3d(width, out, kernel, stride, padding)
-            # stable-baselines3 leaves 3D convolutions at torch's default, whose gain below 1 lets a sparse grid fade
-            # to nothing over six layers.
-            nn.init.orthogonal_(convolution.weight, 2**0.5)
-            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
-            layers += [convolution, nn.ReLU()]
-            width = out
-        convolutions = nn.Sequential(*layers, nn.Flatten())
+        super().__init__()
+        inputs = (GRIDS, *channels)
+        self.layers = nn.ModuleList(
+            nn.Conv3d(i, o, kernel, stride, (kernel - 1) // 2)
+            for i, o, kernel, stride in zip(inputs, channels, kernels, strides, strict=False)
+        )
+        self.register_buffer("_bit", torch.arange(8, dtype=torch.uint8), persistent=False)
         with torch.no_grad():
-            grid_features = convolutions(torch.zeros(1, *grid_shape)).shape[1]
-        flat_keys = [key for key in sorted(observation_space.spaces) if key != GRID_KEY]
-        flat_features = sum(int(np.prod(observation_space[key].shape or ())) for key in flat_keys)
-        super().__init__(observation_space, grid_features + flat_features)
-        self.convolutions = convolutions
-        self.flat_keys = flat_keys
-        self.velocity_scale = velocity_scale
-        limits = torch.as_tensor(np.asarray(joint_limits, dtype=np.float32))
-        self.register_buffer("joint_middle", limits.mean(dim=1))
-        self.register_buffer("joint_half_range", (limits[:, 1] - limits[:, 0]) / 2)
+            self.out_features = self.convolve(torch.zeros(1, GRIDS, *(GRID_SIZE,) * 3)).shape[1]
 
-    def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """Entries of shape (n, ...), grids as bytes or floats -> (n, features)."""
-        parts = [self.convolutions(observations[GRID_KEY].float())]
-        for key in self.flat_keys:
-            value = observations[key].float()
-            if key == "qpos":
-                value = (value - self.joint_middle) / self.joint_half_range
-            elif key == "qvel":
-                value = value / self.velocity_scale
-            parts.append(value.flatten(start_dim=1))
-        return torch.cat(parts, dim=1)
+    def encode(self, occupancy: Tensor) -> Tensor:
+        """(n, 2, 32, 32, 32) uint8 -> (n, 8192) uint8, eight voxels along z in a byte."""
+        bits = occupancy.flatten(1).view(len(occupancy), -1, 8) << self._bit
+        return bits.sum(2, dtype=torch.uint8)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """(n, 8192) uint8 -> (n, out_features)."""
+        voxels = (grid[:, :, None] >> self._bit) & 1
+        return self.convolve(voxels.view(-1, GRIDS, *(GRID_SIZE,) * 3).float())
+
+    def convolve(self, voxels: Tensor) -> Tensor:
+        """(n, 2, 32, 32, 32) float32 -> (n, out_features)."""
+        for layer in self.layers:
+            voxels = torch.relu(layer(voxels))
+        return voxels.flatten(1)
 
 
-def policy_arguments(network: NetworkConfig, joint_limits: tuple[tuple[float, float], ...]) -> dict[str, Any]:
-    """``policy_kwargs`` for ``MultiInputPolicy``: the extractor, a 4-layer MLP each for policy and value, Adam."""
-    return {
-        "features_extractor_class": GridAndJointsExtractor,
-        "features_extractor_kwargs": {
-            "channels": network.channels,
-            "kernels": network.kernels,
-            "strides": network.strides,
-            "joint_limits": joint_limits,
-        },
-        "net_arch": {"pi": list(network.hidden), "vf": list(network.hidden)},
-        "activation_fn": nn.ReLU,
-        "log_std_init": network.log_std,
-        "optimizer_class": torch.optim.Adam,
-    }
+class PolicyNetwork(nn.Module):
+    """A Gaussian policy and a value: one trunk for the grids, then an MLP each.
+
+    Args:
+        trunk: :class:`PatchTrunk` or :class:`ConvolutionTrunk`.
+        hidden: widths of each MLP's hidden layers.
+        initial_std: standard deviation of the untrained policy, the same for all joints.
+        generator: draws the weights; None leaves torch's own.
+    """
+
+    _middle: Tensor
+    _half_range: Tensor
+
+    def __init__(
+        self,
+        trunk: PatchTrunk | ConvolutionTrunk,
+        hidden: tuple[int, ...],
+        initial_std: float = 0.6,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.policy = _mlp(trunk.out_features + FLAT_SIZE, hidden, NUM_JOINTS)
+        self.value = _mlp(trunk.out_features + FLAT_SIZE, hidden, 1)
+        self.log_std = nn.Parameter(torch.full((NUM_JOINTS,), float(np.log(initial_std))))
+        limits = torch.as_tensor(np.asarray(JOINT_LIMITS, dtype=np.float32))
+        self.register_buffer("_middle", limits.mean(dim=1), persistent=False)
+        self.register_buffer("_half_range", (limits[:, 1] - limits[:, 0]) / 2, persistent=False)
+        if generator is not None:
+            self._initialise(generator)
+
+    def _initialise(self, generator: torch.Generator) -> None:
+        """Orthogonal weights. With torch's default a few touched voxels are lost on their way through six layers."""
+        layers = [module for module in self.modules() if isinstance(module, nn.Linear | nn.Conv3d)]
+        for layer in layers:
+            gain = 0.01 if layer is self.policy[-1] else 1.0 if layer is self.value[-1] else 2**0.5
+            nn.init.orthogonal_(layer.weight, gain, generator=generator)
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+
+    def encode(self, observation: Mapping[str, Tensor]) -> Encoded:
+        """Entries of protocol section 6, each (n, ...) -> what the other methods take."""
+        with torch.no_grad():
+            parts = (
+                (observation["qpos"].float() - self._middle) / self._half_range,
+                observation["qvel"].float() / VELOCITY_SCALE,
+                observation["time"].float(),
+                observation["touch"].float(),
+            )
+            return Encoded(self.trunk.encode(observation["occupancy"]), torch.cat(parts, dim=1))
+
+    def forward(self, inputs: Encoded) -> tuple[Tensor, Tensor]:
+        """Mean actions (n, 28) and values (n,)."""
+        features = self._features(inputs)
+        return self.policy(features), self.value(features)[:, 0]
+
+    def mean_action(self, inputs: Encoded) -> Tensor:
+        """Mean actions (n, 28)."""
+        return self.policy(self._features(inputs))
+
+    def _features(self, inputs: Encoded) -> Tensor:
+        return torch.cat([self.trunk(inputs.grid), inputs.flat], dim=1)
+
+
+def _mlp(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ReLU()]
+        inputs = width
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+
+
+def _patch_order() -> Tensor:
+    """(8192,) where in a (2, 16, 16, 16) array each number lies that :class:`PatchTrunk` stores."""
+    bits = torch.arange(GRIDS * 16**3).view(GRIDS, *(2,) * 12)  # grid, x's four bits, y's, z's
+    return bits.permute(1, 5, 9, 2, 6, 10, 3, 7, 11, 0, 4, 8, 12).flatten()
+
+
+NETWORKS: Final[dict[str, Callable[[float, torch.Generator | None], PolicyNetwork]]] = {
+    "fast": lambda std, generator: PolicyNetwork(PatchTrunk(), (256, 256), std, generator),
+    "paper": lambda std, generator: PolicyNetwork(ConvolutionTrunk(), (256, 256, 256), std, generator),
+}
+"""Id -> makes the network from the policy's initial standard deviation and a generator."""

@@ -1,4 +1,4 @@
-"""Trains a learned baseline with stable-baselines3's PPO (protocol section 11).
+"""Trains a learned baseline with PPO (protocol section 11): environments, checkpoints, logs and the finished model.
 
 A run is cut into chunks of ``checkpoint_every`` steps. Each chunk starts from a checkpoint, with freshly reset
 environments and random numbers seeded from (seed, steps so far): a run that was killed and resumed ends with the same
@@ -20,43 +20,44 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from torch.utils.tensorboard import SummaryWriter
 
 import tslam_bench
 from tslam_bench.assets.store import asset_sha256, list_objects
-from tslam_bench.baselines.network import NETWORKS, policy_arguments
+from tslam_bench.baselines.model_files import make_network, write_model
+from tslam_bench.baselines.ppo import PPO
 from tslam_bench.baselines.registry import get_baseline
-from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE, PAPER_STEPS, TrainingConfig
-from tslam_bench.baselines.vector import TactileVecEnv
+from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS, TrainingConfig
 from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_directory, atomic_file, ensure_writable_directory, write_json
-from tslam_bench.hand_constants import JOINT_LIMITS
+from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
+from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
 
 CHECKPOINT_STATE: Final = "state.json"
+CHECKPOINT_TENSORS: Final = "state.pt"
+CURVE_FILE: Final = "curve.jsonl"
+"""One line per iteration: what TensorBoard gets, for programs."""
+Report = Callable[[int, dict[str, float]], None]
+"""Called with the control steps so far and the figures of the last iteration, empty during the first."""
 
 
 def train(
-    config: TrainingConfig, output: Path, command: str = "", on_progress: Callable[[int], None] | None = None
+    config: TrainingConfig, output: Path, command: str = "", on_progress: Report | None = None
 ) -> dict[str, Any]:
     """Trains, or goes on with, the run in ``output``; a finished one is left as it is.
 
-    Writes ``model.zip`` (stable-baselines3), ``model.json`` (the returned metadata), ``tensorboard/`` and, while it
+    Writes ``model.safetensors``, ``model.json`` (the returned metadata), ``curve.jsonl``, ``tensorboard/`` and, while it
     runs, ``checkpoints/<steps>/``.
 
     Args:
-        config: settings.
+        config: the recipe.
         output: the model's directory.
         command: command line to record.
-        on_progress: called with the steps done so far, after every environment step.
+        on_progress: called after every decision.
 
     Returns:
-        Metadata: settings, steps, seconds, mean return of the last episodes, machine, versions, command.
+        Metadata: recipe, steps, seconds, mean return of the last iteration, machine, versions, command.
 
     Raises:
         InvalidInputError: a setting is unusable, or ``output`` holds a run with other settings.
@@ -71,7 +72,6 @@ def train(
         return metadata
     assets = _assets(config)
     ensure_writable_directory(output)
-    torch.set_num_threads(config.torch_threads)
     checkpoint = _last_checkpoint(output)
     state = json.loads((checkpoint / CHECKPOINT_STATE).read_text(encoding="utf-8")) if checkpoint else None
     if state is not None:
@@ -79,52 +79,38 @@ def train(
         if state["assets"] != assets:
             raise InvalidInputError(f"{output}: was begun with other objects; delete it or choose another output")
 
-    normalised = VecNormalize(
-        VecMonitor(TactileVecEnv(make_training_environments(config))),
-        norm_obs=False,
-        norm_reward=True,
-        gamma=config.gamma,
-        clip_reward=np.inf,
-    )
-    space = normalised.observation_space
-    assert isinstance(space, spaces.Dict)
+    threads = torch.get_num_threads()
+    environments = make_training_environments(config)
     try:
-        if checkpoint is None or state is None:
-            model = _new_model(config, normalised)
-            seconds_before, mean_return = 0.0, None
-        else:
-            model = PPO.load(checkpoint / MODEL_FILE, env=normalised, device=learning_device(config))
-            statistics = normalised.ret_rms
-            statistics.mean, statistics.var = np.float64(state["return_mean"]), np.float64(state["return_variance"])
-            statistics.count = state["return_count"]
-            seconds_before, mean_return = float(state["seconds"]), state["mean_return"]
-        model.set_logger(configure(str(output / "tensorboard"), ["tensorboard"]))
-        start = time.perf_counter()
-        while model.num_timesteps < config.total_steps:
-            steps = min(config.chunk_steps, config.total_steps - model.num_timesteps)
-            _learn_chunk(model, config, steps, on_progress)
-            if model.ep_info_buffer:
-                mean_return = float(np.mean([episode["r"] for episode in model.ep_info_buffer]))
-            if model.num_timesteps < config.total_steps:
-                seconds = seconds_before + time.perf_counter() - start
-                _save_checkpoint(model, normalised, config, assets, output, seconds, mean_return)
-        seconds = seconds_before + time.perf_counter() - start
+        network = make_network(config.network, config.initial_std, config.seed)
+        learner = PPO(config, environments, network, learning_device(config))
+        if checkpoint is not None and state is not None:
+            tensors = torch.load(checkpoint / CHECKPOINT_TENSORS, map_location=learner.device, weights_only=True)
+            learner.load_state(tensors)
+        log = _Log(config, output, learner, state)
+        with log:
+            while learner.steps < config.total_steps:
+                _learn_chunk(learner, config, log, on_progress)
+                if learner.steps < config.total_steps:
+                    _save_checkpoint(learner, config, assets, output, log)
     finally:
-        normalised.close()
+        environments.close()
+        torch.set_num_threads(threads)
 
     spec = get_baseline(config.baseline)
     metadata = {
         "baseline": spec.id,
         "reward_mode": spec.reward_mode,
         "privileged": spec.privileged,
+        "control_mode": config.control_mode,
+        "action_repeat": config.action_repeat,
         "config": _plain(config),
         "assets": assets,
-        "steps": model.num_timesteps,
+        "steps": learner.steps,
         "paper_steps": PAPER_STEPS,
         "seed": config.seed,
-        "seconds": round(seconds, 1),
-        "mean_return": mean_return,
-        "observations": {key: list(entry.shape or ()) for key, entry in space.spaces.items()},
+        "seconds": round(log.seconds, 1),
+        "mean_return": log.mean_return,
         "machine": machine_description(),
         "versions": {
             "tslam_bench": tslam_bench.__version__,
@@ -133,15 +119,13 @@ def train(
         },
         "command": command or " ".join(sys.argv),
     }
-    with atomic_file(output / MODEL_FILE) as temporary:
-        model.save(temporary)
-    write_json(metadata_path, metadata)
+    write_model(output, network, metadata)
     shutil.rmtree(output / "checkpoints", ignore_errors=True)
     return metadata
 
 
 def make_training_environments(config: TrainingConfig) -> VectorEnv:
-    """The environments of a run: objects and poses drawn per episode."""
+    """The environments of a run: objects and poses drawn per episode; a step is a decision."""
     return tslam_bench.make_vec(
         ENVIRONMENT_ID,
         config.num_envs,
@@ -149,7 +133,9 @@ def make_training_environments(config: TrainingConfig) -> VectorEnv:
         objects=config.objects or None,
         split=config.split,
         reward_mode=get_baseline(config.baseline).reward_mode or "none",
+        control_mode=config.control_mode,
         processes=config.processes,
+        action_repeat=config.action_repeat,
     )
 
 
@@ -170,70 +156,80 @@ def machine_description() -> dict[str, Any]:
     return {"system": platform.system(), "processor": processor, "cores": os.cpu_count()}
 
 
-class _Progress(BaseCallback):
-    def __init__(self, report: Callable[[int], None]) -> None:
-        super().__init__()
-        self._report = report
+class _Log:
+    """TensorBoard, the curve file and the clock of a run; a resumed run goes on with those of the checkpoint."""
 
-    def _on_step(self) -> bool:
-        self._report(self.model.num_timesteps)
-        return True
+    def __init__(self, config: TrainingConfig, output: Path, learner: PPO, state: dict[str, Any] | None) -> None:
+        self._learner = learner
+        self._has_coverage = get_baseline(config.baseline).reward_mode != "no_coverage"
+        self._seconds_before = float(state["seconds"]) if state else 0.0
+        self._start = self._last = time.perf_counter()
+        self.mean_return: float | None = state["mean_return"] if state else None
+        self.figures: dict[str, float] = {}
+        self._curve = output / CURVE_FILE
+        lines = self._curve.read_text(encoding="utf-8").splitlines() if self._curve.is_file() else []
+        done = [line for line in lines if line.endswith("}") and json.loads(line)["steps"] <= learner.steps]
+        self._curve.write_text("".join(f"{line}\n" for line in done), encoding="utf-8")
+        self._writer = SummaryWriter(str(output / "tensorboard"), purge_step=learner.steps + 1)
+
+    def __enter__(self) -> _Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that the run took so far, earlier parts included."""
+        return self._seconds_before + time.perf_counter() - self._start
+
+    def add(self, learned: dict[str, float], steps: int) -> None:
+        """Takes down an iteration of ``steps`` control steps."""
+        now = time.perf_counter()
+        figures = {f"train/{name}": value for name, value in learned.items()}
+        episodes = self._learner.episodes
+        if episodes:
+            mean = {name: float(np.mean([episode[name] for episode in episodes])) for name in episodes[0]}
+            coverage = COVERAGE_WEIGHT * mean["new_visited"] if self._has_coverage else 0.0
+            self.mean_return = mean["return"]
+            figures["episode/return"] = mean["return"]
+            figures["episode/touched_voxels"] = mean["new_touched"]
+            figures["episode/visited_voxels"] = mean["new_visited"]
+            figures["episode/reward_coverage"] = coverage
+            figures["episode/reward_discovery"] = mean["return"] - coverage
+        figures["time/steps_per_second"] = steps / (now - self._last)
+        for stage, seconds in self._learner.seconds.items():
+            figures[f"time/{stage}_seconds"] = seconds
+        self._last, self.figures = now, figures
+        for name, value in figures.items():
+            self._writer.add_scalar(name, value, self._learner.steps)
+        rounded = {name: round(value, 5) for name, value in figures.items()}
+        with self._curve.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"steps": self._learner.steps, **rounded}) + "\n")
 
 
-def _new_model(config: TrainingConfig, environments: VecNormalize) -> PPO:
-    limits = tuple((float(low), float(high)) for low, high in np.asarray(JOINT_LIMITS))
-    return PPO(
-        "MultiInputPolicy",
-        environments,
-        learning_rate=config.learning_rate,
-        n_steps=config.rollout_steps,
-        batch_size=min(config.batch_size, config.iteration_steps),
-        n_epochs=config.epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        clip_range=config.clip_range,
-        ent_coef=config.entropy_coefficient,
-        policy_kwargs=policy_arguments(NETWORKS[config.network], limits),
-        seed=config.seed,
-        device=learning_device(config),
-    )
-
-
-def _learn_chunk(model: PPO, config: TrainingConfig, steps: int, on_progress: Callable[[int], None] | None) -> None:
-    """``steps`` more steps, as a function of the model's state alone."""
-    chunk_seed = int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]) >> 1
-    model.set_random_seed(chunk_seed)  # torch, numpy (minibatches), and the environments' next reset
-    model._last_obs = None  # makes `learn` reset the environments
-    assert model.env is not None
-    model.env.set_options(
-        {"reconfigure": True}
-    )  # a GPU scene draws other objects then; the CPU does so at every episode
-    callback = _Progress(on_progress) if on_progress else None
-    model.learn(total_timesteps=steps, callback=callback, log_interval=1, reset_num_timesteps=False)
+def _learn_chunk(learner: PPO, config: TrainingConfig, log: _Log, on_progress: Report | None) -> None:
+    """The steps up to the next checkpoint, as a function of the learner's state alone."""
+    end = min(learner.steps + config.chunk_steps, config.total_steps)
+    learner.begin(int(np.random.SeedSequence([config.seed, learner.steps]).generate_state(1)[0]))
+    report = None if on_progress is None else lambda done: on_progress(done, log.figures)
+    while learner.steps < end:
+        log.add(learner.iterate(report), config.iteration_steps)
 
 
 def _save_checkpoint(
-    model: PPO,
-    normalised: VecNormalize,
-    config: TrainingConfig,
-    assets: dict[str, Any],
-    output: Path,
-    seconds: float,
-    mean_return: float | None,
+    learner: PPO, config: TrainingConfig, assets: dict[str, Any], output: Path, log: _Log
 ) -> None:
     """Writes ``checkpoints/<steps>/`` atomically, then removes older ones."""
-    target = output / "checkpoints" / f"{model.num_timesteps:010d}"
+    target = output / "checkpoints" / f"{learner.steps:010d}"
     with atomic_directory(target) as temporary:
-        model.save(temporary / MODEL_FILE)
+        torch.save(learner.state(), temporary / CHECKPOINT_TENSORS)
         state = {
             "config": _plain(config),
             "assets": assets,
-            "steps": model.num_timesteps,
-            "return_mean": float(normalised.ret_rms.mean),
-            "return_variance": float(normalised.ret_rms.var),
-            "return_count": float(normalised.ret_rms.count),
-            "seconds": seconds,
-            "mean_return": mean_return,
+            "steps": learner.steps,
+            "seconds": log.seconds,
+            "mean_return": log.mean_return,
         }
         write_json(temporary / CHECKPOINT_STATE, state)
     for other in target.parent.iterdir():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, get_args
 
@@ -15,81 +16,112 @@ PAPER_STEPS: Final = 10_000_000
 """Training budget of the paper, in environment steps."""
 
 
-MODEL_FILE: Final = "model.zip"
-"""stable-baselines3's archive of a finished model. ``PPO.load`` runs code in it; our own reader does not."""
+MODEL_FILE: Final = "model.safetensors"
+"""A finished model's weights: numbers alone, so that a stranger's model cannot run code."""
 METADATA_FILE: Final = "model.json"
 """Written last: a model directory without it is unfinished."""
-NetworkName = Literal["small", "paper"]
+NetworkName = Literal["fast", "paper"]
+ControlMode = Literal["pd_joint_pos", "pd_joint_delta_pos"]
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of one training run."""
+    """The recipe of one training run. *Steps* are control steps over all environments."""
 
     baseline: Annotated[str, tyro.conf.Positional]
     """Id of a learned baseline; it decides the reward."""
     steps: int = PAPER_STEPS
-    """Environment steps over all environments; rounded up to whole PPO iterations (num_envs * rollout_steps)."""
+    """Control steps; rounded up to whole iterations (num_envs * rollout_steps)."""
     seed: int = 0
     """Seeds weights, exploration, minibatches, and the objects and poses that are drawn."""
-    num_envs: int = 8
-    """Environments that are stepped side by side."""
     split: str = "train"
     """Objects to train on; the test split is refused."""
     objects: tuple[str, ...] = ()
     """Restricts training to these objects of the split; empty: all of it."""
-    network: NetworkName = "paper"
-    """Size of the policy network."""
-    rollout_steps: int = 2 * HORIZON
-    """Steps per environment and PPO iteration."""
+    control_mode: ControlMode = "pd_joint_pos"
+    """What actions mean: absolute joint targets, or differences to the joint positions."""
+    action_repeat: int = 4
+    """Control steps that each action is held for; a divisor of the episode's 200."""
+    network: NetworkName = "fast"
+    """Policy network; fast: matrix products for a CPU; paper: six 3D convolutions."""
+    initial_std: float = 0.6
+    """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
+    num_envs: int = 32
+    """Environments that are stepped side by side."""
+    rollout_steps: int = HORIZON
+    """Control steps per environment and iteration: one episode; a multiple of action_repeat."""
     batch_size: int = 400
-    """Minibatch size (samples)."""
-    epochs: int = 5
-    """Passes over each iteration's samples."""
+    """Minibatch size (decisions)."""
+    epochs: int = 6
+    """Passes over each iteration's decisions, at most."""
+    target_kl: float = 0.1
+    """No further pass once the approximate KL divergence from the policy that acted exceeds this."""
     learning_rate: float = 3e-4
     """Adam's step size."""
-    gamma: float = 0.99
-    """Discount (paper: 0.99)."""
+    gamma: float = 0.97
+    """Discount per decision; 0.97 per 4 control steps is 0.992 per control step (paper: 0.99)."""
     gae_lambda: float = 0.95
     """Decay of generalised advantage estimation."""
     clip_range: float = 0.2
     """PPO's clip of the probability ratio."""
+    value_coefficient: float = 0.5
+    """Weight of the value's squared error."""
     entropy_coefficient: float = 0.0
     """Weight of the entropy bonus."""
+    max_gradient: float = 0.5
+    """Gradients with a larger norm are scaled down to it."""
     checkpoint_every: int = 64_000
-    """Steps between checkpoints; rounded up to whole PPO iterations."""
+    """Control steps between checkpoints; rounded up to whole iterations."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto: on a CUDA GPU where there is one (not run on a GPU yet)."""
     processes: int | None = None
     """Worker processes that simulate on the CPU; default: the cores. Results do not depend on it."""
-    torch_threads: int = 1
-    """Threads of torch. One is fastest on CPUs: with two, the learner was measured more than ten times slower."""
+    torch_threads: int = 2
+    """Threads of torch while it learns on a CPU; the simulation waits then. One if other work keeps the cores busy."""
 
     def check(self) -> None:
         """Raises InvalidInputError unless every setting is usable. Not done on creation: tyro would box the message."""
         spec = get_baseline(self.baseline)
         if spec.kind != "learned":
             raise InvalidInputError(f"baseline {self.baseline!r}: is {spec.kind}, there is nothing to train")
-        for name in ("steps", "num_envs", "rollout_steps", "batch_size", "epochs", "checkpoint_every", "torch_threads"):
+        for name in (
+            *("steps", "num_envs", "rollout_steps", "action_repeat", "batch_size", "epochs"),
+            *("checkpoint_every", "torch_threads"),
+        ):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
+        for name in ("initial_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidInputError(f"{name} {getattr(self, name)}: must be a number above 0")
+        for name in ("value_coefficient", "entropy_coefficient"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InvalidInputError(f"{name} {getattr(self, name)}: must not be negative")
         if self.processes is not None and self.processes < 1:
             raise InvalidInputError(f"processes {self.processes}: must be at least 1")
         if self.seed < 0:
             raise InvalidInputError(f"seed {self.seed}: must not be negative")
-        if self.num_envs * self.rollout_steps < 2:
-            raise InvalidInputError("rollout_steps: num_envs * rollout_steps must be at least 2")
-        if not 0 < self.gamma <= 1 or not 0 <= self.gae_lambda <= 1 or self.learning_rate <= 0:
-            raise InvalidInputError("gamma and gae_lambda must lie in (0, 1] and [0, 1], learning_rate above 0")
+        if self.rollout_steps % self.action_repeat:
+            raise InvalidInputError(
+                f"rollout_steps {self.rollout_steps}: must be a multiple of action_repeat {self.action_repeat}"
+            )
+        if self.num_envs * self.decisions < 2:
+            raise InvalidInputError("rollout_steps: an iteration needs at least two decisions")
+        if not 0 < self.gamma <= 1 or not 0 <= self.gae_lambda <= 1:
+            raise InvalidInputError("gamma and gae_lambda must lie in (0, 1] and [0, 1]")
         if self.split == "test":
             raise InvalidInputError("split 'test': baselines are trained on the train split only; choose 'train'")
-        if self.network not in get_args(NetworkName):
-            names = ", ".join(get_args(NetworkName))
-            raise InvalidInputError(f"network {self.network!r}: unknown; choose one of {names}")
+        for name, known in (("network", get_args(NetworkName)), ("control_mode", get_args(ControlMode))):
+            if getattr(self, name) not in known:
+                raise InvalidInputError(f"{name} {getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")
+
+    @property
+    def decisions(self) -> int:
+        """Decisions per environment and iteration."""
+        return self.rollout_steps // self.action_repeat
 
     @property
     def iteration_steps(self) -> int:
-        """Environment steps of one PPO iteration."""
+        """Control steps of one iteration."""
         return self.num_envs * self.rollout_steps
 
     @property

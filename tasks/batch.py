@@ -39,6 +39,8 @@ STEP_ARRAYS: dict[str, tuple[tuple[int, ...], type]] = {
     "elapsed_steps": ((), np.int32),
 }
 """Shape and type of what else one environment's step returns."""
+SUMMED = ("reward", "new_touched", "new_visited")
+"""Step arrays that add up over control steps with one action."""
 FINAL = "final_"
 """Prefix of the arrays that hold an episode's last observation while its environment starts the next one."""
 
@@ -150,8 +152,20 @@ class HandBatch:
         ):
             self._arrays[name][list(envs)] = 0
 
-    def step(self) -> None:
-        """One control step of all environments with the actions in the arrays; ended episodes start anew at once."""
+    def step(self, repeat: int = 1) -> None:
+        """``repeat`` control steps of all environments with the actions in the arrays; ended episodes start anew at once.
+
+        What is in ``SUMMED`` is added up. ``repeat`` is the same in all calls and a divisor of the horizon, so that an
+        episode ends with the last of these steps if it ends.
+        """
+        self._control_step()
+        for _ in range(repeat - 1):
+            before = {name: self._arrays[name].copy() for name in SUMMED}
+            self._control_step()
+            for name, value in before.items():
+                self._arrays[name][:] += value
+
+    def _control_step(self) -> None:
         arrays = self._arrays
         targets = self._targets(arrays["action"], arrays["qpos"])
         for scene, target in zip(self._scenes, targets.tolist(), strict=True):
@@ -176,7 +190,7 @@ class HandBatch:
         arrays, kept = self._arrays, {}
         for name in OBSERVATION_ARRAYS:
             arrays[FINAL + name][ended] = arrays[name][ended]
-        for name in ("reward", "new_touched", "new_visited"):
+        for name in SUMMED:
             kept[name] = arrays[name][ended].copy()
         self.reset([None] * len(ended), ended.tolist())
         for name, value in kept.items():

@@ -16,6 +16,9 @@ from gymnasium.vector.utils import batch_space
 
 from tslam_bench.constants import HORIZON
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.tasks.vector_env import check_action_repeat
+
+_COUNTS = ("new_touched", "new_visited")
 
 
 class BatchedVectorEnv(VectorEnv):
@@ -30,11 +33,13 @@ class BatchedVectorEnv(VectorEnv):
 
     Args:
         environment: what ``gymnasium.make`` returned.
+        action_repeat: see :class:`tslam_bench.tasks.vector_env.TactileVectorEnv`.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(self, environment: gym.Env) -> None:
+    def __init__(self, environment: gym.Env, action_repeat: int = 1) -> None:
+        self.action_repeat = check_action_repeat(action_repeat)
         base: Any = environment.unwrapped
         self.environment: Any = environment
         self.num_envs = int(base.num_envs)
@@ -77,7 +82,25 @@ class BatchedVectorEnv(VectorEnv):
         return observation, _without_reconfigure(info)
 
     def step(self, actions: Any) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
-        """One control step of every environment. Raises InvalidInputError for actions of the wrong shape."""
+        """One control step of every environment, or ``action_repeat`` of them.
+
+        Raises:
+            InvalidInputError: actions of the wrong shape.
+        """
+        observation, total, terminated, truncated, info = self._control_step(actions)
+        for _ in range(self.action_repeat - 1):
+            before, total = {name: info[name].clone() for name in _COUNTS}, total.clone()
+            observation, reward, terminated, truncated, info = self._control_step(actions)
+            total = total + reward
+            for name, value in before.items():
+                info[name] = info[name] + value
+                if "final_info" in info:
+                    info["final_info"][name] = info["final_info"][name] + value
+        return observation, total, terminated, truncated, info
+
+    def _control_step(
+        self, actions: Any
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
         observation, reward, terminated, truncated, info = self.environment.step(actions)
         info = _without_reconfigure(info)
         self._steps += 1

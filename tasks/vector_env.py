@@ -24,7 +24,6 @@ from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
 from tslam_bench.tasks.batch import FINAL, OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
 
-_STEP: Final = ("step", None)
 MAX_ENVIRONMENTS: Final = 4096
 """More environments than this in one machine's memory are a slip of the pen."""
 STEP_TIMEOUT: Final = 60.0
@@ -64,9 +63,11 @@ class TactileVectorEnv(VectorEnv):
         settings: objects, pose, reward mode, control mode.
         processes: worker processes; None means the cores, but no more than there are environments.
         timeout: seconds after which a worker that does not answer a step counts as hung.
+        action_repeat: control steps that a step holds its action for; rewards and counts are added up. A divisor of the
+            horizon. Bit for bit what that many steps with the same action give, with one request per worker.
 
     Raises:
-        InvalidInputError: a bad number of environments or processes, unknown object, pose, reward or control mode.
+        InvalidInputError: a bad number of environments, processes or repeats, unknown object, pose, reward or control mode.
         AssetError: objects or the hand are not prepared.
         WorkerError: a worker died or hung; all workers are then stopped.
     """
@@ -74,7 +75,12 @@ class TactileVectorEnv(VectorEnv):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
     def __init__(
-        self, num_envs: int, settings: BatchSettings, processes: int | None = None, timeout: float = STEP_TIMEOUT
+        self,
+        num_envs: int,
+        settings: BatchSettings,
+        processes: int | None = None,
+        timeout: float = STEP_TIMEOUT,
+        action_repeat: int = 1,
     ) -> None:
         for name, value, low, high in (
             ("num_envs", num_envs, 1, MAX_ENVIRONMENTS),
@@ -84,6 +90,7 @@ class TactileVectorEnv(VectorEnv):
                 raise InvalidInputError(f"{name} {value!r}: must be a whole number from {low} to {high}")
         if not isinstance(timeout, (int, float)) or not 0 < timeout < float("inf"):
             raise InvalidInputError(f"timeout {timeout!r}: must be a number of seconds above 0")
+        self.action_repeat = check_action_repeat(action_repeat)
         self._timeout = float(timeout)
         self._starts = settings.sampler()  # fail here, in one line, rather than in a worker
         self._variant = self._starts.variant
@@ -165,7 +172,7 @@ class TactileVectorEnv(VectorEnv):
         return self._observation(), self._info()
 
     def step(self, actions: Any) -> tuple[dict[str, NDArray], NDArray, NDArray, NDArray, dict[str, Any]]:
-        """One control step of every environment.
+        """One control step of every environment, or ``action_repeat`` of them.
 
         Raises:
             InvalidInputError: actions of the wrong shape or not finite.
@@ -174,7 +181,7 @@ class TactileVectorEnv(VectorEnv):
         self._check_open()
         self._arrays["action"][:] = self._checked(actions)
         for _, pipe in self._workers:
-            self._send(pipe, _STEP)
+            self._send(pipe, ("step", self.action_repeat))
         self._collect(self._timeout)
         truncated = self._arrays["truncated"].copy()
         info = self._info()
@@ -286,6 +293,14 @@ class TactileVectorEnv(VectorEnv):
         return {name: self._arrays[name].copy() for name in ("elapsed_steps", "new_touched", "new_visited")}
 
 
+def check_action_repeat(action_repeat: int) -> int:
+    """Raises InvalidInputError unless episodes are whole numbers of ``action_repeat`` control steps."""
+    whole = isinstance(action_repeat, (int, np.integer)) and not isinstance(action_repeat, bool)
+    if not whole or action_repeat < 1 or HORIZON % action_repeat:
+        raise InvalidInputError(f"action_repeat {action_repeat!r}: must divide the {HORIZON} steps of an episode")
+    return int(action_repeat)
+
+
 def _available_cores() -> list[int]:
     """The cores that this process may use."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
@@ -336,7 +351,7 @@ def _work(
                 return
             answer = None
             if request == "step":
-                batch.step()
+                batch.step(argument)
             elif request == "state":
                 answer = batch.state()
             elif argument is not None:

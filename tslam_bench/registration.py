@@ -35,6 +35,7 @@ def make_vec(
     control_mode: str = "pd_joint_delta_pos",
     processes: int | None = None,
     timeout: float = 60.0,
+    action_repeat: int = 1,
 ) -> gymnasium.vector.VectorEnv:
     """A Gymnasium vector environment (1.x semantics, autoreset ``SAME_STEP``) of many hands.
 
@@ -55,9 +56,10 @@ def make_vec(
         control_mode: see the environment.
         processes: CPU worker processes; None means the cores.
         timeout: seconds after which a CPU worker that does not answer a step counts as hung.
+        action_repeat: control steps that a step holds its action for, a divisor of the horizon; rewards are added up.
 
     Raises:
-        InvalidInputError: unknown id, device, object, pose or mode; CUDA asked for where there is none.
+        InvalidInputError: unknown id, device, object, pose or mode, a bad action_repeat; CUDA asked for where there is none.
         AssetError: objects or the hand are not prepared.
     """
     get_variant(environment_id)
@@ -75,6 +77,7 @@ def make_vec(
                 "reward_mode": reward_mode,
                 "control_mode": control_mode,
             },
+            action_repeat,
         )
     if device == "cuda":
         raise InvalidInputError("device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto")
@@ -83,7 +86,7 @@ def make_vec(
 
     chosen = None if objects is None else tuple(objects)
     settings = BatchSettings(object, chosen, split, pose, reward_mode, control_mode, environment_id)
-    return TactileVectorEnv(num_envs, settings, processes, timeout)
+    return TactileVectorEnv(num_envs, settings, processes, timeout, action_repeat)
 
 
 def _cuda_available() -> bool:
@@ -92,11 +95,13 @@ def _cuda_available() -> bool:
     return torch.cuda.is_available()
 
 
-def _make_cuda_vec(environment_id: str, num_envs: int, kwargs: dict[str, Any]) -> gymnasium.vector.VectorEnv:
+def _make_cuda_vec(
+    environment_id: str, num_envs: int, kwargs: dict[str, Any], action_repeat: int
+) -> gymnasium.vector.VectorEnv:
     from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
 
     environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)  # GPU only
-    return BatchedVectorEnv(environment)
+    return BatchedVectorEnv(environment, action_repeat)
 
 
 def register_environments() -> None:

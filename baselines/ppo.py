@@ -1,0 +1,279 @@
+"""Proximal policy optimisation (Schulman et al., 2017) of a Gaussian policy in a Gymnasium vector environment.
+
+One class from top to bottom: an iteration collects a fixed number of decisions from every environment, computes advantages
+(generalised advantage estimation, Schulman et al., 2016), and makes several passes of clipped updates over them. Runs on
+CPU and GPU tensors alike; environments may return numpy arrays or tensors.
+
+What an end of an episode means: episodes end at the horizon and nowhere else, and the observation holds the time. So the
+horizon is a true end, whose value is zero, not a cut whose value is to be guessed: what counts is what was felt by then.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor, nn
+
+from tslam_bench.baselines.network import Encoded, PolicyNetwork
+from tslam_bench.baselines.training_config import TrainingConfig
+
+STAGES: Final = ("simulate", "encode", "infer", "learn")
+"""Where an iteration's time goes; ``encode`` is copying observations into the rollout buffer's form."""
+COUNTS: Final = ("new_touched", "new_visited")
+"""Entries of the environments' ``info`` that are summed over each episode, where there are such."""
+_HALF_LOG_TAU: Final = 0.5 * float(np.log(2 * np.pi))
+
+
+def advantages(
+    rewards: Tensor, values: Tensor, ended: Tensor, last_value: Tensor, gamma: float, gae_lambda: float
+) -> Tensor:
+    """Generalised advantage estimates, (T, n).
+
+    Args:
+        rewards: (T, n) float32.
+        values: (T, n) float32, of the observations in which the actions were chosen.
+        ended: (T, n) bool, whether an episode ended with that step: nothing behind it counts.
+        last_value: (n,) float32, of the observations after the last step.
+        gamma: discount per decision.
+        gae_lambda: decay of the estimator.
+    """
+    result = torch.zeros_like(rewards)
+    after, following = torch.zeros_like(last_value), last_value
+    for step in reversed(range(len(rewards))):
+        goes_on = (~ended[step]).float()
+        error = rewards[step] + gamma * goes_on * following - values[step]
+        after = error + gamma * gae_lambda * goes_on * after
+        result[step], following = after, values[step]
+    return result
+
+
+def log_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """(n,) log density of (n, k) actions under independent normals; unclipped actions, as the policy drew them."""
+    scaled = (actions - mean) * torch.exp(-log_std)
+    return -(0.5 * scaled.square() + log_std + _HALF_LOG_TAU).sum(-1)
+
+
+def policy_loss(log_ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
+    """PPO's clipped surrogate, a scalar to minimise; ``log_ratio`` (n,) is log pi_new - log pi_old."""
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
+    return -torch.minimum(ratio * advantage, clipped * advantage).mean()
+
+
+@dataclass
+class ReturnScale:
+    """Running variance of the discounted return, by whose root rewards are divided: (Chan et al., 1979) in batches."""
+
+    count: float = 1e-4
+    mean: float = 0.0
+    variance: float = 1.0
+
+    def update(self, returns: Tensor) -> None:
+        """Takes a batch of discounted returns into account."""
+        count, mean = returns.numel(), float(returns.double().mean())
+        variance = float(returns.double().var(unbiased=False))
+        total, shift = self.count + count, mean - self.mean
+        squares = self.variance * self.count + variance * count + shift**2 * self.count * count / total
+        self.count, self.mean, self.variance = total, self.mean + shift * count / total, squares / total
+
+    @property
+    def factor(self) -> float:
+        """What rewards are multiplied by."""
+        return float((self.variance + 1e-8) ** -0.5)
+
+
+@dataclass
+class Rollout:
+    """What an iteration collected: (T, n, ...) tensors on the learning device.
+
+    ``counts`` (T, n, 2) holds :data:`COUNTS`; ``last_value`` (n,) is the value of the observations after the last step.
+    """
+
+    inputs: Encoded
+    actions: Tensor
+    log_probability: Tensor
+    values: Tensor
+    rewards: Tensor
+    ended: Tensor
+    counts: Tensor
+    last_value: Tensor
+
+
+class PPO:
+    """Trains ``network`` in ``environments``.
+
+    Args:
+        config: the recipe. One step of the environments is one decision, ``config.action_repeat`` control steps.
+        environments: a vector environment with autoreset ``SAME_STEP``.
+        network: encodes observations, and gives mean actions and values.
+        device: where to learn.
+    """
+
+    def __init__(self, config: TrainingConfig, environments: VectorEnv, network: PolicyNetwork, device: str) -> None:
+        self.config = config
+        self.environments = environments
+        self.device = torch.device(device)
+        self.network = network.to(self.device)
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
+        self.scale = ReturnScale()
+        self.steps = 0
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self.episodes: list[dict[str, float]] = []
+        self._generator = torch.Generator()
+
+    def begin(self, seed: int) -> None:
+        """Resets environments and random numbers: what follows depends on ``seed`` and :meth:`state` alone."""
+        self._generator.manual_seed(seed)
+        # A GPU scene draws other objects when it is reconfigured; the CPU does so at every episode.
+        self._observation, _ = self.environments.reset(seed=seed % 2**31, options={"reconfigure": True})
+        self._sums = torch.zeros(self.environments.num_envs, 1 + len(COUNTS))
+        self._discounted = torch.zeros(self.environments.num_envs, device=self.device)
+
+    def iterate(self, on_progress: Callable[[int], None] | None = None) -> dict[str, float]:
+        """One iteration; returns its figures by name. ``on_progress`` gets the control steps so far.
+
+        ``episodes`` then holds, for each episode that ended in it, its return and the sums of :data:`COUNTS`.
+        """
+        if self.device.type == "cpu":
+            torch.set_num_threads(1)  # small batches, and the simulation wants the cores
+        rollout = self._collect(on_progress)
+        self._count_episodes(rollout)
+        with self._timed("learn"):
+            if self.device.type == "cpu":
+                torch.set_num_threads(self.config.torch_threads)
+            return self._learn(rollout)
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`load_state` needs to go on: plain numbers and tensors."""
+        scale = (self.scale.count, self.scale.mean, self.scale.variance)
+        network, optimizer = self.network.state_dict(), self.optimizer.state_dict()
+        return {"steps": self.steps, "scale": scale, "network": network, "optimizer": optimizer}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Goes on from what :meth:`state` returned."""
+        self.steps, self.scale = int(state["steps"]), ReturnScale(*state["scale"])
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    # -- collecting -------------------------------------------------------------------------------------------
+    def _collect(self, on_progress: Callable[[int], None] | None) -> Rollout:
+        decisions, std = self.config.decisions, self.network.log_std.detach().exp()
+        kept: list[tuple[Tensor, ...]] = []
+        inputs = []
+        for _ in range(decisions):
+            with self._timed("encode"):
+                inputs.append(self._encode())
+            with self._timed("infer"), torch.inference_mode():
+                mean, value = self.network(inputs[-1])
+                noise = torch.randn(mean.shape, generator=self._generator).to(self.device)
+                action = mean + std * noise
+                log_probability_ = log_probability(action, mean, self.network.log_std)
+            with self._timed("simulate"):
+                is_numpy = isinstance(self._observation["qpos"], np.ndarray)
+                result = self.environments.step(action.cpu().numpy() if is_numpy else action)
+                self._observation, reward, terminated, truncated, info = result
+            ended = self._tensor(terminated).bool() | self._tensor(truncated).bool()
+            reward = self._tensor(reward).float()
+            counts = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
+            kept.append((action, log_probability_, value, reward, ended, torch.stack(counts, dim=1)))
+            self.steps += self.config.action_repeat * self.environments.num_envs
+            if on_progress is not None:
+                on_progress(self.steps)
+        with torch.inference_mode():
+            _, last_value = self.network(self._encode())
+        columns = [torch.stack(column) for column in zip(*kept, strict=True)]
+        encoded = Encoded(torch.stack([i.grid for i in inputs]), torch.stack([i.flat for i in inputs]))
+        return Rollout(encoded, *columns, last_value)
+
+    def _encode(self) -> Encoded:
+        return self.network.encode({key: self._tensor(value) for key, value in self._observation.items()})
+
+    def _tensor(self, value: Any) -> Tensor:
+        return torch.as_tensor(value, device=self.device)
+
+    def _count_episodes(self, rollout: Rollout) -> None:
+        """Adds up returns and counts, and fills ``episodes`` with those of the episodes that ended."""
+        self.episodes = []
+        columns = torch.cat([rollout.rewards[:, :, None], rollout.counts], dim=2).cpu()
+        for step, ended in zip(columns, rollout.ended.cpu(), strict=True):
+            self._sums += step
+            for env in ended.nonzero()[:, 0].tolist():
+                self.episodes.append(dict(zip(("return", *COUNTS), self._sums[env].tolist(), strict=True)))
+                self._sums[env] = 0
+
+    # -- learning ---------------------------------------------------------------------------------------------
+    def _scaled(self, rewards: Tensor, ended: Tensor) -> Tensor:
+        """Rewards divided by the running standard deviation of the discounted return, these ones included."""
+        returns = torch.zeros_like(rewards)
+        for step in range(len(rewards)):
+            self._discounted = self._discounted * self.config.gamma + rewards[step]
+            returns[step] = self._discounted
+            self._discounted = self._discounted * ~ended[step]
+        self.scale.update(returns)
+        return rewards * self.scale.factor
+
+    def _learn(self, rollout: Rollout) -> dict[str, float]:
+        config = self.config
+        rewards = self._scaled(rollout.rewards, rollout.ended)
+        advantage = advantages(
+            rewards, rollout.values, rollout.ended, rollout.last_value, config.gamma, config.gae_lambda
+        )
+        target = (advantage + rollout.values).flatten()
+        explained = 1 - float((target - rollout.values.flatten()).var() / (target.var() + 1e-12))
+        advantage = ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).flatten()
+        inputs = Encoded(rollout.inputs.grid.flatten(0, 1), rollout.inputs.flat.flatten(0, 1))
+        actions, old = rollout.actions.flatten(0, 1), rollout.log_probability.flatten()
+        figures: dict[str, float] = {}
+        for epoch in range(config.epochs):
+            sums = torch.zeros(4, device=self.device)
+            batches = list(self._minibatches(len(target)))
+            for chosen in batches:
+                batch = (inputs[chosen], actions[chosen], old[chosen], advantage[chosen], target[chosen])
+                sums += self._update(*batch)
+            names = ("policy_loss", "value_loss", "approximate_kl", "clip_fraction")
+            figures = dict(zip(names, (sums / len(batches)).tolist(), strict=True))
+            figures["epochs"] = epoch + 1
+            if figures["approximate_kl"] > config.target_kl:
+                break
+        log_std = self.network.log_std.detach()
+        figures["entropy"] = float((log_std + 0.5 + _HALF_LOG_TAU).sum())
+        figures["std"] = float(log_std.exp().mean())
+        figures["explained_variance"] = explained
+        return figures
+
+    def _minibatches(self, samples: int) -> Iterator[Tensor]:
+        """Indices of shuffled minibatches of (nearly) equal size that together name every sample once."""
+        order = torch.randperm(samples, generator=self._generator).to(self.device)
+        yield from order.tensor_split(max(1, round(samples / self.config.batch_size)))
+
+    def _update(self, inputs: Encoded, actions: Tensor, old: Tensor, advantage: Tensor, target: Tensor) -> Tensor:
+        """One step of Adam; (4,) policy loss, value loss, approximate KL, share of clipped samples."""
+        config = self.config
+        mean, value = self.network(inputs)
+        log_ratio = log_probability(actions, mean, self.network.log_std) - old
+        surrogate = policy_loss(log_ratio, advantage, config.clip_range)
+        value_loss = (value - target).square().mean()
+        loss = surrogate + config.value_coefficient * value_loss
+        if config.entropy_coefficient:
+            loss = loss - config.entropy_coefficient * self.network.log_std.sum()
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), config.max_gradient)
+        self.optimizer.step()
+        with torch.no_grad():
+            kl = (log_ratio.exp() - 1 - log_ratio).mean()  # http://joschu.net/blog/kl-approx.html
+            clipped = (log_ratio.exp() - 1).abs().gt(config.clip_range).float().mean()
+            return torch.stack([surrogate.detach(), value_loss.detach(), kl, clipped])
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] += time.perf_counter() - start

@@ -85,7 +85,10 @@ class LearnedBaseline:
             tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observation.items()}
             encoded = self._network.encode(tensors)
             # One at a time: the bits of a batched product depend on the batch, an episode must not.
-            rows = [self._network.mean_action(encoded[row : row + 1]).numpy() for row in range(len(self._generators))]
+            rows = [
+                self._network.mean_action(encoded.rows(slice(row, row + 1))).numpy()
+                for row in range(len(self._generators))
+            ]
         actions = np.concatenate(rows)
         if not self._deterministic:
             noise = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]

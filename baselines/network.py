@@ -11,7 +11,8 @@ policy and value from that.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -30,18 +31,19 @@ COUNT_SCALE: Final = 0.25
 """Factor on the number of voxels (0 to 8) that are set in a block."""
 
 
-class Encoded(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Encoded:
     """Observations as a rollout buffer keeps them.
 
     Attributes:
-        grid: (n, bytes) uint8, both grids.
+        grid: (n, 8192) uint8, both grids.
         flat: (n, FLAT_SIZE) float32, of the order of 1.
     """
 
     grid: Tensor
     flat: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> Encoded:  # type: ignore[override]
+    def rows(self, index: Tensor | slice) -> Encoded:
         """Some of the observations."""
         return Encoded(self.grid[index], self.flat[index])
 
@@ -62,8 +64,8 @@ class PatchTrunk(nn.Module):
     def __init__(self, channels: tuple[int, int, int] = (8, 32, 32)) -> None:
         super().__init__()
         self.out_features = 8 * channels[2]
-        widths = (8 * GRIDS, 8 * channels[0], 8 * channels[1])
-        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(widths, channels, strict=True))
+        self._widths = (8 * GRIDS, 8 * channels[0], 8 * channels[1])
+        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(self._widths, channels, strict=True))
         self.register_buffer("_order", _patch_order(), persistent=False)
 
     def encode(self, occupancy: Tensor) -> Tensor:
@@ -75,10 +77,10 @@ class PatchTrunk(nn.Module):
 
     def forward(self, grid: Tensor) -> Tensor:
         """(n, 8192) uint8 -> (n, out_features)."""
-        n, features = len(grid), grid.float() * COUNT_SCALE
-        for layer in self.layers:
-            features = torch.relu(layer(features.view(-1, layer.in_features)))
-        return features.view(n, -1)
+        features = grid.float() * COUNT_SCALE
+        for layer, width in zip(self.layers, self._widths, strict=True):
+            features = torch.relu(layer(features.view(-1, width)))
+        return features.view(len(grid), -1)
 
 
 class ConvolutionTrunk(nn.Module):
@@ -89,6 +91,8 @@ class ConvolutionTrunk(nn.Module):
         kernels: edge of each kernel, in voxels of its input.
         strides: stride of each.
     """
+
+    _bit: Tensor
 
     def __init__(
         self,
@@ -197,7 +201,7 @@ def _mlp(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
 def _patch_order() -> Tensor:
     """(8192,) where in a (2, 16, 16, 16) array each number lies that :class:`PatchTrunk` stores."""
     bits = torch.arange(GRIDS * 16**3).view(GRIDS, *(2,) * 12)  # grid, x's four bits, y's, z's
-    return bits.permute(1, 5, 9, 2, 6, 10, 3, 7, 11, 0, 4, 8, 12).flatten()
+    return bits.permute(1, 5, 9, 2, 6, 10, 3, 7, 11, 4, 8, 12, 0).flatten()
 
 
 NETWORKS: Final[dict[str, Callable[[float, torch.Generator | None], PolicyNetwork]]] = {

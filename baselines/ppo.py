@@ -10,6 +10,7 @@ horizon is a true end, whose value is zero, not a cut whose value is to be guess
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -160,7 +161,7 @@ class PPO:
         """Goes on from what :meth:`state` returned."""
         self.steps, self.scale = int(state["steps"]), ReturnScale(*state["scale"])
         self.network.load_state_dict(state["network"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # Adam would go on in the given tensors
 
     # -- collecting -------------------------------------------------------------------------------------------
     def _collect(self, on_progress: Callable[[int], None] | None) -> Rollout:
@@ -174,23 +175,23 @@ class PPO:
                 mean, value = self.network(inputs[-1])
                 noise = torch.randn(mean.shape, generator=self._generator).to(self.device)
                 action = mean + std * noise
-                log_probability_ = log_probability(action, mean, self.network.log_std)
+                drawn_with = log_probability(action, mean, self.network.log_std)
             with self._timed("simulate"):
                 is_numpy = isinstance(self._observation["qpos"], np.ndarray)
                 result = self.environments.step(action.cpu().numpy() if is_numpy else action)
                 self._observation, reward, terminated, truncated, info = result
-            ended = self._tensor(terminated).bool() | self._tensor(truncated).bool()
+            end = self._tensor(terminated).bool() | self._tensor(truncated).bool()
             reward = self._tensor(reward).float()
-            counts = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
-            kept.append((action, log_probability_, value, reward, ended, torch.stack(counts, dim=1)))
+            count = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
+            kept.append((action, drawn_with, value, reward, end, torch.stack(count, dim=1)))
             self.steps += self.config.action_repeat * self.environments.num_envs
             if on_progress is not None:
                 on_progress(self.steps)
         with torch.inference_mode():
             _, last_value = self.network(self._encode())
-        columns = [torch.stack(column) for column in zip(*kept, strict=True)]
+        actions, log_probabilities, values, rewards, ended, counts = map(torch.stack, zip(*kept, strict=True))
         encoded = Encoded(torch.stack([i.grid for i in inputs]), torch.stack([i.flat for i in inputs]))
-        return Rollout(encoded, *columns, last_value)
+        return Rollout(encoded, actions, log_probabilities, values, rewards, ended, counts, last_value)
 
     def _encode(self) -> Encoded:
         return self.network.encode({key: self._tensor(value) for key, value in self._observation.items()})
@@ -235,8 +236,9 @@ class PPO:
             sums = torch.zeros(4, device=self.device)
             batches = list(self._minibatches(len(target)))
             for chosen in batches:
-                batch = (inputs[chosen], actions[chosen], old[chosen], advantage[chosen], target[chosen])
-                sums += self._update(*batch)
+                sums += self._update(
+                    inputs.rows(chosen), actions[chosen], old[chosen], advantage[chosen], target[chosen]
+                )
             names = ("policy_loss", "value_loss", "approximate_kl", "clip_fraction")
             figures = dict(zip(names, (sums / len(batches)).tolist(), strict=True))
             figures["epochs"] = epoch + 1

@@ -42,9 +42,7 @@ Report = Callable[[int, dict[str, float]], None]
 """Called with the control steps so far and the figures of the last iteration, empty during the first."""
 
 
-def train(
-    config: TrainingConfig, output: Path, command: str = "", on_progress: Report | None = None
-) -> dict[str, Any]:
+def train(config: TrainingConfig, output: Path, command: str = "", on_progress: Report | None = None) -> dict[str, Any]:
     """Trains, or goes on with, the run in ``output``; a finished one is left as it is.
 
     Writes ``model.safetensors``, ``model.json`` (the returned metadata), ``curve.jsonl``, ``tensorboard/`` and, while it
@@ -217,9 +215,7 @@ def _learn_chunk(learner: PPO, config: TrainingConfig, log: _Log, on_progress: R
         log.add(learner.iterate(report), config.iteration_steps)
 
 
-def _save_checkpoint(
-    learner: PPO, config: TrainingConfig, assets: dict[str, Any], output: Path, log: _Log
-) -> None:
+def _save_checkpoint(learner: PPO, config: TrainingConfig, assets: dict[str, Any], output: Path, log: _Log) -> None:
     """Writes ``checkpoints/<steps>/`` atomically, then removes older ones."""
     target = output / "checkpoints" / f"{learner.steps:010d}"
     with atomic_directory(target) as temporary:

@@ -100,6 +100,10 @@ class TrainingConfig:
             raise InvalidInputError(f"processes {self.processes}: must be at least 1")
         if self.seed < 0:
             raise InvalidInputError(f"seed {self.seed}: must not be negative")
+        if HORIZON % self.action_repeat:
+            raise InvalidInputError(
+                f"action_repeat {self.action_repeat}: must divide the {HORIZON} steps of an episode"
+            )
         if self.rollout_steps % self.action_repeat:
             raise InvalidInputError(
                 f"rollout_steps {self.rollout_steps}: must be a multiple of action_repeat {self.action_repeat}"

@@ -1,9 +1,10 @@
-"""PPO training in the real environment on two boxes: it resumes exactly, learns, and refuses bad settings."""
+"""Training runs in the real environment on two boxes: they resume exactly, log, and refuse bad settings."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,34 +12,46 @@ import numpy as np
 import pytest
 import torch
 from baseline_assets import primitive_cache
-from counting_environment import Counter
-from gymnasium import spaces
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tslam_bench.baselines import training
 from tslam_bench.baselines.evaluate import EvaluationConfig, evaluate, make_reconstructors
-from tslam_bench.baselines.learned import read_policy
+from tslam_bench.baselines.model_files import read_model
 from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.training import train
 from tslam_bench.baselines.training_config import MODEL_FILE, TrainingConfig
-from tslam_bench.baselines.vector import TactileVecEnv
+from tslam_bench.constants import HORIZON
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.leaderboard.submission import read_submission
+from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
 
 CONFIG = TrainingConfig(
     baseline="tslam",
-    steps=120,
+    steps=2400,
     num_envs=2,
-    rollout_steps=20,
-    batch_size=20,
+    rollout_steps=200,
+    action_repeat=20,
+    batch_size=5,
     epochs=2,
-    network="small",
-    checkpoint_every=40,
+    checkpoint_every=800,
     processes=1,
+    torch_threads=1,
 )
+"""Six iterations of one episode of both hands, with a checkpoint after every second."""
+Report = Callable[[int, dict[str, float]], None]
+
+
+class Killed(Exception):
+    pass
+
+
+def kill_at(limit: int) -> Report:
+    def report(done: int, figures: dict[str, float]) -> None:
+        if done >= limit:
+            raise Killed
+
+    return report
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,77 +70,97 @@ def straight(cache, tmp_path_factory) -> Path:
     return output
 
 
-def weights(output: Path) -> list[torch.Tensor]:
-    return list(read_policy(output).state_dict().values())
+def weights(output: Path) -> dict[str, torch.Tensor]:
+    return dict(read_model(output)[0].state_dict())
+
+
+def same(one: Path, other: Path) -> bool:
+    pairs = zip(weights(one).values(), weights(other).values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
 
 
 def test_finished_run_holds_what_it_promises(straight: Path) -> None:
     metadata = json.loads((straight / "model.json").read_text())
-    assert metadata["steps"] == 120 and metadata["baseline"] == "tslam" and metadata["reward_mode"] == "tslam"
+    assert metadata["steps"] == 2400 and metadata["baseline"] == "tslam" and metadata["reward_mode"] == "tslam"
     assert metadata["assets"]["objects"] == 2 and len(metadata["assets"]["sha256"]) == 64
     assert metadata["command"] == "the command" and metadata["seconds"] > 0 and metadata["machine"]["cores"] >= 1
+    assert metadata["control_mode"] == "pd_joint_pos" and metadata["action_repeat"] == 20 and metadata["seed"] == 0
     assert not (straight / "checkpoints").exists()
+    baseline = make_baseline("tslam", straight)
+    assert baseline.control_mode == "pd_joint_pos"
+
+
+def test_curves_add_up(straight: Path) -> None:
+    curve = [json.loads(line) for line in (straight / "curve.jsonl").read_text().splitlines()]
+    assert [line["steps"] for line in curve] == [400, 800, 1200, 1600, 2000, 2400]
+    for line in curve:
+        terms = line["episode/reward_discovery"] + line["episode/reward_coverage"]
+        assert line["episode/return"] == pytest.approx(terms, rel=1e-4)
+        assert line["episode/reward_coverage"] == pytest.approx(
+            COVERAGE_WEIGHT * line["episode/visited_voxels"], rel=1e-4
+        )
+        assert line["episode/reward_discovery"] == pytest.approx(line["episode/touched_voxels"], abs=1e-3)
+        assert line["episode/visited_voxels"] > 1000 and line["time/steps_per_second"] > 0
     events = EventAccumulator(str(straight / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("time/fps")] == [40, 80, 120]
-    baseline = make_baseline("tslam", straight)
-    baseline.reset(1, 0)
+    promised = {"episode/return", "episode/touched_voxels", "episode/reward_discovery", "episode/reward_coverage"}
+    promised |= {f"train/{name}" for name in ("entropy", "approximate_kl", "clip_fraction", "explained_variance")}
+    assert promised | {"time/steps_per_second"} <= set(events.Tags()["scalars"])
+    assert [event.step for event in events.Scalars("episode/return")] == [line["steps"] for line in curve]
 
 
 def test_submission_of_a_trained_model_states_its_budget(straight: Path, tmp_path: Path) -> None:
     config = EvaluationConfig("tslam", ("phone",), object_set="quick", model=straight)
     (path,) = evaluate(config, make_reconstructors(("grid",)), tmp_path)
     info = read_submission(path).info
-    assert info.training.steps == 120 and info.training.wall_time_hours > 0 and "cores" in info.training.hardware
+    assert info.training.steps == 2400 and info.training.wall_time_hours > 0 and "cores" in info.training.hardware
     assert (info.explorer, info.reward_mode, info.privileged) == ("tslam", "tslam", False)
+    assert info.control_mode == "pd_joint_pos"
+    actions = np.load(next((tmp_path / "rollouts" / "tslam" / "phone").glob("*.npz")))["actions"]
+    held = actions.reshape(HORIZON // 20, 20, -1)
+    assert (held == held[:, :1]).all() and not (held[1:, 0] == held[:-1, 0]).any()
     other = tmp_path / "other"
     shutil.copytree(straight, other)
-    (other / MODEL_FILE).write_bytes((straight / MODEL_FILE).read_bytes() + b" ")
-    with pytest.raises(InvalidInputError, match="episodes of another model"):
+    train(replace(CONFIG, seed=5, steps=400), tmp_path / "second")
+    (other / MODEL_FILE).write_bytes((tmp_path / "second" / MODEL_FILE).read_bytes())
+    with pytest.raises(InvalidInputError, match="holds other episodes"):
         evaluate(replace(config, model=other), make_reconstructors(("grid",)), tmp_path)
 
 
-def test_policy_read_without_pickle_is_the_saved_one(straight: Path) -> None:
-    model = PPO.load(straight / MODEL_FILE, device="cpu")
-    for ours, theirs in zip(weights(straight), model.policy.state_dict().values(), strict=True):
-        assert torch.equal(ours, theirs)
-
-
 def test_killed_and_resumed_run_ends_with_the_same_weights(straight: Path, tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill_at(limit: int):
-        def report(done: int) -> None:
-            if done >= limit:
-                raise Killed
-
-        return report
-
-    for limit in (10, 60, 110):  # before the first checkpoint, and twice between checkpoints
+    for limit in (40, 1000, 2200):  # before the first checkpoint, and twice between checkpoints
         with pytest.raises(Killed):
             train(CONFIG, tmp_path, on_progress=kill_at(limit))
         assert not (tmp_path / "model.json").exists()
         with pytest.raises(InvalidInputError, match="no finished model"):
             make_baseline("tslam", tmp_path)
     # A write that was cut off leaves a hidden folder, which must not be taken for a checkpoint.
-    (tmp_path / "checkpoints" / ".0000000120-cut").mkdir()
+    (tmp_path / "checkpoints" / ".0000002400-cut").mkdir()
+    with (tmp_path / "curve.jsonl").open("a") as file:
+        file.write('{"steps": 2000, "episode/ret')
     metadata = train(CONFIG, tmp_path)
-    assert metadata["steps"] == 120
-    for straight_weight, resumed_weight in zip(weights(straight), weights(tmp_path), strict=True):
-        assert torch.equal(straight_weight, resumed_weight)
+    assert metadata["steps"] == 2400 and same(straight, tmp_path)
+    curves = [
+        [{k: v for k, v in json.loads(line).items() if "time/" not in k} for line in text.splitlines()]
+        for text in ((folder / "curve.jsonl").read_text() for folder in (straight, tmp_path))
+    ]
+    assert curves[0] == curves[1]
+
+
+def test_rollouts_shorter_than_an_episode_resume_as_well(tmp_path: Path) -> None:
+    config = replace(CONFIG, rollout_steps=60, steps=480, checkpoint_every=240)
+    train(config, tmp_path / "straight")
+    with pytest.raises(Killed):
+        train(config, tmp_path / "killed", on_progress=kill_at(400))
+    train(config, tmp_path / "killed")
+    assert same(tmp_path / "straight", tmp_path / "killed")
+    (first, *_) = (tmp_path / "straight" / "curve.jsonl").read_text().splitlines()
+    assert "episode/return" not in json.loads(first)  # no episode has ended yet
 
 
 def test_checkpoint_of_other_objects_is_refused(tmp_path: Path, cache: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill(done: int) -> None:
-        if done > 40:
-            raise Killed
-
     with pytest.raises(Killed):
-        train(CONFIG, tmp_path, on_progress=kill)
+        train(CONFIG, tmp_path, on_progress=kill_at(1000))
     moved = cache / "objects" / "plate"
     (cache / "objects" / "train" / "plate").rename(moved)
     try:
@@ -146,20 +179,20 @@ def test_split_that_is_not_prepared(tmp_path: Path) -> None:
 def test_finished_model_is_not_trained_again(straight: Path, monkeypatch) -> None:
     monkeypatch.setattr(training, "make_training_environments", lambda config: pytest.fail("environments were made"))
     before = (straight / MODEL_FILE).read_bytes()
-    assert train(CONFIG, straight)["steps"] == 120
+    assert train(CONFIG, straight)["steps"] == 2400
     assert (straight / MODEL_FILE).read_bytes() == before
 
 
 def test_other_settings_in_the_same_folder_are_refused(straight: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"steps 120 there, 160 here.*choose another output"):
-        train(replace(CONFIG, steps=160), straight)
+    with pytest.raises(InvalidInputError, match=r"steps 2400 there, 2800 here.*choose another output"):
+        train(replace(CONFIG, steps=2800), straight)
 
 
 def test_every_parameter_is_trained(straight: Path, tmp_path: Path) -> None:
-    train(replace(CONFIG, steps=40), tmp_path)
-    for (name, early), late in zip(read_policy(tmp_path).state_dict().items(), weights(straight), strict=True):
-        if "joint_" not in name:  # the joint limits are constants
-            assert not torch.equal(early, late), name
+    train(replace(CONFIG, steps=400), tmp_path)
+    late = weights(straight)
+    for name, early in weights(tmp_path).items():
+        assert not torch.equal(early, late[name]), name
 
 
 @pytest.mark.parametrize(
@@ -172,7 +205,13 @@ def test_every_parameter_is_trained(straight: Path, tmp_path: Path) -> None:
         ({"num_envs": -1}, "num_envs -1"),
         ({"seed": -1}, "seed -1"),
         ({"network": "huge"}, "network 'huge'"),
+        ({"control_mode": "torque"}, "control_mode 'torque'"),
         ({"gamma": 1.5}, "gamma"),
+        ({"learning_rate": float("nan")}, "learning_rate nan"),
+        ({"initial_std": 0.0}, "initial_std 0.0"),
+        ({"entropy_coefficient": -1.0}, "entropy_coefficient -1.0"),
+        ({"rollout_steps": 30}, "rollout_steps 30: must be a multiple of action_repeat 20"),
+        ({"action_repeat": 3, "rollout_steps": 201}, "action_repeat 3: must divide the 200 steps"),
     ],
 )
 def test_bad_settings_are_one_line_and_write_nothing(change, message: str, tmp_path: Path) -> None:
@@ -198,59 +237,26 @@ def test_objects_restrict_the_draw(cache) -> None:
 
 def test_the_number_of_processes_changes_nothing(straight: Path, tmp_path: Path) -> None:
     train(replace(CONFIG, processes=2), tmp_path)
-    for one, other in zip(weights(straight), weights(tmp_path), strict=True):
-        assert torch.equal(one, other)
-    assert train(replace(CONFIG, processes=1), tmp_path)["steps"] == 120  # no other settings: nothing to refuse
+    assert same(straight, tmp_path)
+    assert train(replace(CONFIG, processes=1), tmp_path)["steps"] == 2400  # no other settings: nothing to refuse
 
 
-def test_torch_threads_are_one_unless_asked_for(tmp_path: Path) -> None:
+def test_threads_are_given_back(tmp_path: Path) -> None:
     before = torch.get_num_threads()
     try:
-        for asked, expected in ((None, 1), (2, 2)):
-            torch.set_num_threads(3)
-            config = replace(CONFIG, steps=40) if asked is None else replace(CONFIG, steps=40, torch_threads=asked)
-            train(config, tmp_path / str(asked))
-            assert torch.get_num_threads() == expected
+        torch.set_num_threads(3)
+        train(replace(CONFIG, steps=400), tmp_path)
+        assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
 
 
+def test_the_paper_network_trains_in_the_other_control_mode(tmp_path: Path) -> None:
+    config = replace(CONFIG, network="paper", control_mode="pd_joint_delta_pos", steps=400)
+    assert train(config, tmp_path)["control_mode"] == "pd_joint_delta_pos"
+    assert make_baseline("tslam", tmp_path).control_mode == "pd_joint_delta_pos"
+
+
 def test_rounding_of_budgets() -> None:
-    config = replace(CONFIG, steps=81, checkpoint_every=41)
-    assert (config.iteration_steps, config.total_steps, config.chunk_steps) == (40, 120, 80)
-
-
-def test_learner_improves_where_improving_is_easy(tmp_path: Path) -> None:
-    """The whole learner on a hand-made task with the real observation space: it finds out what pays."""
-
-    class PaysForClosing(Counter):
-        """Pays the mean of the action: the best policy saturates at 1."""
-
-        def __init__(self) -> None:
-            super().__init__((20,) * 8)
-            shapes = {"qpos": (28,), "qvel": (28,), "touch": (18,), "time": (1,)}
-            entries = {key: spaces.Box(-np.inf, np.inf, shape, np.float32) for key, shape in shapes.items()}
-            entries["occupancy"] = spaces.Box(0, 1, (2, 32, 32, 32), np.uint8)
-            self.set_spaces(entries, 28)
-            self.zeros = {
-                key: torch.zeros(8, *space.shape, dtype=torch.uint8 if space.dtype == np.uint8 else torch.float32)
-                for key, space in entries.items()
-            }
-
-        def _observe(self):
-            return self.zeros
-
-        def pay(self):
-            assert self.last_actions is not None
-            return self.last_actions.mean(dim=1)
-
-    torch.set_num_threads(1)
-    environments = VecNormalize(VecMonitor(TactileVecEnv(PaysForClosing())), norm_obs=False)
-    config = replace(CONFIG, num_envs=8, rollout_steps=20, batch_size=40, epochs=5, learning_rate=1e-3)
-    model = training._new_model(config, environments)
-    returns = []
-    for _ in range(12):
-        model.ep_info_buffer = None
-        model.learn(160, reset_num_timesteps=False)
-        returns.append(np.mean([episode["r"] for episode in model.ep_info_buffer]))
-    assert returns[-1] > returns[0] + 2.0  # of 20 at most; the first is about 0
+    config = replace(CONFIG, steps=801, checkpoint_every=401)
+    assert (config.iteration_steps, config.total_steps, config.chunk_steps, config.decisions) == (400, 1200, 800, 10)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,25 +15,16 @@ import torch
 
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.baselines.interface import Baseline, episode_generators
-from tslam_bench.baselines.learned import LearnedBaseline, build_policy
+from tslam_bench.baselines.learned import LearnedBaseline
+from tslam_bench.baselines.model_files import make_network, read_model, write_model
+from tslam_bench.baselines.network import NETWORKS, PolicyNetwork
 from tslam_bench.baselines.random_actions import RandomBaseline
 from tslam_bench.baselines.random_targets import RandomTargetsBaseline
 from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
-from tslam_bench.baselines.training_config import METADATA_FILE
+from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH
-
-METADATA = {
-    "config": {"network": "small"},
-    "observations": {
-        "qpos": [NUM_JOINTS],
-        "qvel": [NUM_JOINTS],
-        "touch": [len(SKIN_LINKS)],
-        "occupancy": [2, GRID_SIZE, GRID_SIZE, GRID_SIZE],
-        "time": [1],
-    },
-}
 
 
 def observation(qpos: np.ndarray, generator: np.random.Generator | None = None) -> dict[str, np.ndarray]:
@@ -52,10 +46,12 @@ def start(n: int) -> np.ndarray:
     return np.clip(qpos, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
 
 
+METADATA = {"config": {"network": "fast", "control_mode": "pd_joint_pos", "action_repeat": 4}}
+
+
 @pytest.fixture(scope="module")
-def policy():
-    torch.manual_seed(3)
-    return build_policy(METADATA)
+def policy() -> PolicyNetwork:
+    return make_network("fast", seed=3)
 
 
 def make(kind: str, policy) -> Baseline:
@@ -63,8 +59,9 @@ def make(kind: str, policy) -> Baseline:
         "random": RandomBaseline,
         "random_targets": RandomTargetsBaseline,
         "heuristic": HeuristicBaseline,
-        "learned": lambda: LearnedBaseline(policy),
-        "learned mean": lambda: LearnedBaseline(policy, deterministic=True),
+        "learned": lambda: LearnedBaseline(policy, "pd_joint_pos"),
+        "learned held": lambda: LearnedBaseline(policy, "pd_joint_pos", 4),
+        "learned mean": lambda: LearnedBaseline(policy, "pd_joint_pos", deterministic=True),
     }
     return makers[kind]()
 
@@ -110,12 +107,90 @@ def test_make_baseline_refuses_what_has_no_policy_or_no_model(tmp_path) -> None:
         make_baseline("random", tmp_path)
 
 
-def test_damaged_model_is_one_line(tmp_path) -> None:
-    (tmp_path / METADATA_FILE).write_text(json.dumps(METADATA))
-    (tmp_path / "model.zip").write_bytes(b"not an archive")
-    with pytest.raises(InvalidInputError, match=r"cannot be read.*train it again") as caught:
+class Bomb:
+    """Unpickled, it writes a file: what a stranger's model could do if anything read it as a pickle."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.write_text, (self.path, "boom")
+
+
+def spoil(kind: str, folder: Path) -> None:
+    """Damages the model in ``folder``, or makes it a stranger's."""
+    model, metadata = folder / MODEL_FILE, folder / METADATA_FILE
+    record = json.loads(metadata.read_text())
+    if kind == "no archive":
+        model.write_bytes(b"not an archive")
+    elif kind == "cut off":
+        model.write_bytes(model.read_bytes()[:-9])
+    elif kind == "pickle":
+        model.write_bytes(pickle.dumps(Bomb(folder / "boom")))
+    elif kind == "torch archive":
+        torch.save({"weights": Bomb(folder / "boom")}, model)
+    elif kind == "header of 2^60 bytes":
+        model.write_bytes((1 << 60).to_bytes(8, "little") + model.read_bytes()[8:])
+    elif kind == "other network":
+        record["config"]["network"] = "paper"
+    elif kind == "unknown network":
+        record["config"]["network"] = "__import__('os')"
+    elif kind == "not finite":
+        network, _ = read_model(folder)
+        with torch.no_grad():
+            network.log_std[3] = float("nan")
+        write_model(folder, network, record)
+    elif kind == "no recipe":
+        record = ["nothing"]
+    elif kind == "other mode":
+        record["config"]["control_mode"] = "torque"
+    elif kind == "endless":
+        record["config"]["action_repeat"] = 0
+    metadata.write_text(json.dumps(record) if kind != "no json" else "{")
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("no archive", "cannot be read"),
+        ("cut off", "cannot be read"),
+        ("pickle", "cannot be read"),
+        ("torch archive", "cannot be read"),
+        ("header of 2^60 bytes", "cannot be read"),
+        ("other network", "cannot be read"),
+        ("unknown network", "unknown; choose one of fast, paper"),
+        ("not finite", "not finite"),
+        ("no recipe", "cannot be read"),
+        ("no json", "cannot be read"),
+        ("other mode", "control_mode 'torque'"),
+        ("endless", "action_repeat 0"),
+    ],
+)
+def test_damaged_or_hostile_model_is_one_line_and_runs_no_code(kind: str, message: str, policy, tmp_path) -> None:
+    write_model(tmp_path, policy, METADATA)
+    make_baseline("tslam", tmp_path)
+    spoil(kind, tmp_path)
+    with pytest.raises(InvalidInputError, match="train it: tslam-bench baselines train tslam") as caught:
         make_baseline("tslam", tmp_path)
-    assert "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert not (tmp_path / "boom").exists()
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_a_model_that_was_written_is_read_as_it_was(name: str, tmp_path) -> None:
+    network = make_network(name, 0.3, seed=4)
+    write_model(tmp_path, network, {"config": {**METADATA["config"], "network": name}})
+    again, _ = read_model(tmp_path)
+    for (key, one), other in zip(network.state_dict().items(), again.state_dict().values(), strict=True):
+        assert torch.equal(one, other), key
+
+
+def test_a_model_in_half_precision_acts_in_single(policy, tmp_path) -> None:
+    write_model(tmp_path, copy.deepcopy(policy).half(), METADATA)
+    again, _ = read_model(tmp_path)
+    assert again.log_std.dtype == torch.float32 and (tmp_path / MODEL_FILE).stat().st_size < 1e6
+    assert torch.allclose(again.log_std, policy.log_std, atol=1e-3)
+    make_baseline("tslam", tmp_path).reset(1, 0)
 
 
 def test_scripted_baselines_need_no_torch() -> None:
@@ -128,7 +203,7 @@ def test_scripted_baselines_need_no_torch() -> None:
 
 
 # -- every policy -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned mean"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned held", "learned mean"])
 def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> None:
     first = moving_hand(make(kind, policy), [5, 6], 40)
     again = moving_hand(make(kind, policy), [5, 6], 40)
@@ -138,7 +213,7 @@ def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> Non
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned mean"])
+@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned held", "learned mean"])
 def test_an_episode_does_not_depend_on_its_batch(kind: str, policy) -> None:
     together = moving_hand(make(kind, policy), [11, 12, 13], 60)
     alone = moving_hand(make(kind, policy), [12], 60)
@@ -252,33 +327,37 @@ def test_heuristic_visits_different_spots() -> None:
 # -- learned ----------------------------------------------------------------------------------------------------------
 def test_learned_samples_around_its_mean(policy) -> None:
     qpos = np.repeat(start(1), 400, axis=0)
-    drawn, mean = LearnedBaseline(policy), LearnedBaseline(policy, deterministic=True)
+    drawn, mean = make("learned", policy), make("learned mean", policy)
     drawn.reset(400, list(range(400)))
     mean.reset(400, 0)
     centre, actions = mean.act(observation(qpos)), drawn.act(observation(qpos))
     assert np.allclose(centre, centre[:1], atol=1e-5)
-    deviation = float(np.exp(policy.log_std.detach().numpy())[0])
+    deviation = float(policy.log_std.detach().exp()[0])
     inside = np.abs(actions) < 1
     standard = (actions - centre)[np.abs(centre) < 0.2] / deviation
     assert abs(np.median(standard)) < 0.05  # clipping at +-1 does not move the median
     assert 0.7 < inside.mean() < 1.0
 
 
-def test_learned_agrees_with_the_policy_it_was_made_from(policy) -> None:
-    """The short cut through the network gives what stable-baselines3's own prediction gives."""
+def test_learned_agrees_with_the_network_it_was_made_from(policy) -> None:
     generator = np.random.default_rng(8)
     seen = observation(np.repeat(start(1), 3, axis=0) + generator.normal(size=(3, NUM_JOINTS)) * 0.1, generator)
-    baseline = LearnedBaseline(policy, deterministic=True)
+    baseline = make("learned mean", policy)
     baseline.reset(3, 0)
-    expected, _ = policy.predict(seen, deterministic=True)
-    assert np.allclose(baseline.act(seen), expected, atol=1e-5)
-
-
-def test_a_few_touched_voxels_reach_the_features(policy) -> None:
-    """Touch is sparse: the network must not lose it on its way through six convolutions."""
-    grids = torch.zeros(2, 2, GRID_SIZE, GRID_SIZE, GRID_SIZE)
-    grids[:, 1, 8:24, 8:24, 8:24] = 1
-    grids[1, 0, 10:14, 12:20, 12] = 1
     with torch.no_grad():
-        features = policy.features_extractor.convolutions(grids)
-    assert (features[1] - features[0]).norm() > 0.02 * features[0].norm()
+        mean, _ = policy(policy.encode({key: torch.from_numpy(value) for key, value in seen.items()}))
+    assert np.allclose(baseline.act(seen), mean.clamp(-1, 1), atol=1e-5)
+
+
+def test_learned_holds_each_action_and_then_looks_again(policy) -> None:
+    baseline = LearnedBaseline(policy, "pd_joint_pos", 4)
+    every = LearnedBaseline(policy, "pd_joint_pos", 1)
+    for each in (baseline, every):
+        each.reset(2, [3, 4])
+    qpos = [start(2) + 0.01 * step for step in range(12)]
+    actions = np.stack([baseline.act(observation(q)) for q in qpos])
+    for first in (0, 4, 8):
+        assert (actions[first : first + 4] == actions[first]).all()
+        assert np.array_equal(actions[first], every.act(observation(qpos[first])))  # the same noise per decision
+    assert not np.array_equal(actions[0], actions[4])
+    assert baseline.control_mode == "pd_joint_pos"

@@ -64,7 +64,7 @@ def test_quick_run_is_what_it_promises(tmp_path: Path) -> None:
         assert (f"train-{spec.id}" in jobs) == (spec.kind == "learned")
         if spec.kind == "learned":
             command = shlex.join(jobs[f"evaluate-{spec.id}"].command)
-            assert "4,000 steps, proves the path, not the method" in command
+            assert "32,000 steps, proves the path, not the method" in command
     assert tmp_path / "leaderboard.json" in jobs["leaderboard"].outputs
     assert tmp_path / "index.html" in jobs["leaderboard"].outputs
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from baseline_assets import SHAPES, primitive_cache
-from test_baselines import METADATA
 
 import tslam_bench
 from tslam_bench.baselines import evaluate as evaluation
@@ -24,7 +23,8 @@ from tslam_bench.baselines.evaluate import (
     merged_grids,
     reference_grids,
 )
-from tslam_bench.baselines.learned import LearnedBaseline, build_policy
+from tslam_bench.baselines.learned import LearnedBaseline
+from tslam_bench.baselines.model_files import make_network
 from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.rollout import Rollout, roll_out, roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
@@ -211,7 +211,11 @@ def test_batches_of_episodes_are_bit_for_bit_those_of_gym_make(identifier: str) 
     """The CPU vector environment that evaluation uses, against one ManiSkill environment; five episodes in threes."""
     torch.manual_seed(1)
     torch.set_num_threads(1)
-    explorer = LearnedBaseline(build_policy(METADATA)) if identifier == "learned" else make_baseline(identifier)
+    explorer = (
+        LearnedBaseline(make_network("fast", seed=0), "pd_joint_delta_pos", 4)
+        if identifier == "learned"
+        else make_baseline(identifier)
+    )
     episodes = [("phone", 0, 0), ("cubelarge", 5, 0), ("phone", 3, 1), ("cubelarge", 2, 4), ("phone", 6, 0)]
     mode = explorer.control_mode
     envs = tslam_bench.make_vec(ENVIRONMENT_ID, 3, "cpu", split="test", control_mode=mode, processes=2)

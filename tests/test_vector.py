@@ -189,20 +189,36 @@ def test_the_real_environment_passes_what_check_env_asks_of_a_vec_env() -> None:
     vec.close()
 
 
-def test_a_batched_maniskill_task_is_the_same_vector_environment() -> None:
+def test_stable_baselines3_trains_in_the_real_environment_with_held_actions() -> None:
+    """The example of the documentation: its own PPO through the adapter."""
+    envs = tslam_bench.make_vec(
+        ENVIRONMENT_ID, 2, "cpu", object="mug", control_mode="pd_joint_pos", action_repeat=20, processes=1
+    )
+    vec = VecMonitor(TactileVecEnv(envs, seed=0))
+    model = PPO("MultiInputPolicy", vec, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu")
+    before = [weight.clone() for weight in model.policy.action_net.parameters()]
+    model.learn(40)
+    assert model.num_timesteps == 40 and len(model.ep_info_buffer or ()) == 4
+    assert all(episode["l"] == HORIZON // 20 and episode["r"] > 0 for episode in model.ep_info_buffer or ())
+    assert not any(torch.equal(a, b) for a, b in zip(before, model.policy.action_net.parameters(), strict=True))
+    vec.close()
+
+
+@pytest.mark.parametrize("repeat", [1, 4])
+def test_a_batched_maniskill_task_is_the_same_vector_environment(repeat: int) -> None:
     """What CUDA uses, on the CPU with one environment: observations, rewards and ends as ``make_vec``'s, bit for bit."""
     from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
 
     arguments = {"objects": ("mug", "hammer")}
-    batched = BatchedVectorEnv(gym.make(ENVIRONMENT_ID, **arguments))
-    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 1, "cpu", processes=1, **arguments)
+    batched = BatchedVectorEnv(gym.make(ENVIRONMENT_ID, **arguments), repeat)
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 1, "cpu", processes=1, action_repeat=repeat, **arguments)
     assert batched.metadata["autoreset_mode"] == envs.metadata["autoreset_mode"]
     assert batched.observation_space == envs.observation_space and batched.action_space == envs.action_space
     first, second = batched.reset(seed=5), envs.reset(seed=5)
     generator = np.random.default_rng(1)
-    for step in range(HORIZON + 20):
+    for step in range(HORIZON // repeat + 20):
         compare(first, second, f"step {step}")
-        if step == HORIZON + 10:
+        if step == HORIZON // repeat + 10:
             compare(
                 batched.reset(options={"reset_mask": np.array([True]), "pose": 6}),
                 envs.reset(options={"reset_mask": np.array([True]), "pose": 6}),

@@ -75,6 +75,45 @@ def test_bit_for_bit_the_maniskill_task_over_episodes_objects_and_poses(environm
     single.close()
 
 
+@pytest.mark.parametrize(("control_mode", "reward_mode"), [("pd_joint_pos", "tslam"), ("pd_joint_delta_pos", "knn")])
+def test_held_actions_are_bit_for_bit_single_steps(control_mode, reward_mode):
+    """Rewards and counts added up, over the end of an episode, and with episodes that end at different times."""
+    num_envs, repeat, decisions = 3, 8, 40
+    arguments = {"objects": OBJECTS, "control_mode": control_mode, "reward_mode": reward_mode, "processes": 2}
+    held = tslam_bench.make_vec(ENVIRONMENT_ID, num_envs, "cpu", action_repeat=repeat, **arguments)
+    single = tslam_bench.make_vec(ENVIRONMENT_ID, num_envs, "cpu", **arguments)
+    actions = np.stack([actions_of(env, decisions) for env in range(num_envs)], axis=1)
+    for envs in (held, single):
+        envs.reset(seed=5)
+    ends = 0
+    for decision in range(decisions):
+        if decision == 10:
+            for envs in (held, single):
+                envs.reset(options={"reset_mask": np.array([False, True, False])})
+        observation, reward, terminated, truncated, info = held.step(actions[decision])
+        total, sums, final = np.zeros(num_envs, np.float32), dict.fromkeys(("new_touched", "new_visited"), 0), None
+        for step in range(repeat):
+            expected, one, _, ended, expected_info = single.step(actions[decision])
+            total += one
+            sums = {name: value + expected_info[name] for name, value in sums.items()}
+            assert step == repeat - 1 or not ended.any()
+            final = expected_info.get("final_obs")
+        np.testing.assert_array_equal(reward, total)
+        np.testing.assert_array_equal(truncated, ended)
+        assert not terminated.any() and (final is None) == ("final_obs" not in info)
+        for name, value in sums.items():
+            np.testing.assert_array_equal(info[name], value)
+        for key, value in expected.items():
+            np.testing.assert_array_equal(observation[key], value)
+            if final is not None:
+                np.testing.assert_array_equal(info["final_obs"][key][ended], final[key][ended])
+                np.testing.assert_array_equal(info["final_info"]["new_touched"], info["new_touched"])
+        ends += int(ended.sum())
+    assert ends == num_envs  # at different times
+    held.close()
+    single.close()
+
+
 def test_spaces_options_and_partial_resets():
     envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", objects=OBJECTS, processes=1)
     assert envs.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
@@ -107,6 +146,9 @@ def test_spaces_options_and_partial_resets():
         ({"num_envs": 2, "processes": 0}, "processes 0"),
         ({"num_envs": 2, "timeout": 0}, "timeout 0: must be a number of seconds above 0"),
         ({"num_envs": 2, "device": "tpu"}, "device 'tpu': unknown"),
+        ({"num_envs": 2, "action_repeat": 3}, "action_repeat 3: must divide the 200 steps of an episode"),
+        ({"num_envs": 2, "action_repeat": 0}, "action_repeat 0"),
+        ({"num_envs": 2, "action_repeat": 2.0}, r"action_repeat 2\.0"),
         ({"num_envs": 2, "object": "mugg"}, "mugg"),
         ({"num_envs": 2, "pose": 9}, "pose 9"),
         ({"num_envs": 2, "reward_mode": "dense"}, "reward_mode 'dense'"),

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
@@ -107,6 +108,22 @@ class Rollout:
     last_value: Tensor
 
 
+@dataclass
+class Samples:
+    """What is learned from: (n, ...) tensors."""
+
+    inputs: Encoded
+    actions: Tensor
+    log_probability: Tensor
+    advantage: Tensor
+    target: Tensor
+
+    def rows(self, index: Tensor) -> Samples:
+        """Some of the samples."""
+        others = (getattr(self, name)[index] for name in ("actions", "log_probability", "advantage", "target"))
+        return Samples(self.inputs.rows(index), *others)
+
+
 class PPO:
     """Trains ``network`` in ``environments``.
 
@@ -128,6 +145,8 @@ class PPO:
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.episodes: list[dict[str, float]] = []
         self._generator = torch.Generator()
+        self._parts = config.torch_threads if self.device.type == "cpu" else 1
+        self._pool = ThreadPoolExecutor(self._parts, initializer=torch.set_num_threads, initargs=(1,))
 
     def begin(self, seed: int) -> None:
         """Resets environments and random numbers: what follows depends on ``seed`` and :meth:`state` alone."""
@@ -143,12 +162,10 @@ class PPO:
         ``episodes`` then holds, for each episode that ended in it, its return and the sums of :data:`COUNTS`.
         """
         if self.device.type == "cpu":
-            torch.set_num_threads(1)  # small batches, and the simulation wants the cores
+            torch.set_num_threads(1)  # the simulation wants the cores, and minibatches are shared out as a whole
         rollout = self._collect(on_progress)
         self._count_episodes(rollout)
         with self._timed("learn"):
-            if self.device.type == "cpu":
-                torch.set_num_threads(self.config.torch_threads)
             return self._learn(rollout)
 
     def state(self) -> dict[str, Any]:
@@ -226,19 +243,21 @@ class PPO:
         advantage = advantages(
             rewards, rollout.values, rollout.ended, rollout.last_value, config.gamma, config.gae_lambda
         )
-        target = (advantage + rollout.values).flatten()
-        explained = 1 - float((target - rollout.values.flatten()).var() / (target.var() + 1e-12))
-        advantage = ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).flatten()
-        inputs = Encoded(rollout.inputs.grid.flatten(0, 1), rollout.inputs.flat.flatten(0, 1))
-        actions, old = rollout.actions.flatten(0, 1), rollout.log_probability.flatten()
+        target = advantage + rollout.values
+        explained = 1 - float(advantage.var() / (target.var() + 1e-12))
+        samples = Samples(
+            Encoded(rollout.inputs.grid.flatten(0, 1), rollout.inputs.flat.flatten(0, 1)),
+            rollout.actions.flatten(0, 1),
+            rollout.log_probability.flatten(),
+            ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).flatten(),
+            target.flatten(),
+        )
         figures: dict[str, float] = {}
         for epoch in range(config.epochs):
             sums = torch.zeros(4, device=self.device)
-            batches = list(self._minibatches(len(target)))
+            batches = list(self._minibatches(target.numel()))
             for chosen in batches:
-                sums += self._update(
-                    inputs.rows(chosen), actions[chosen], old[chosen], advantage[chosen], target[chosen]
-                )
+                sums += self._update(samples, chosen)
             names = ("policy_loss", "value_loss", "approximate_kl", "clip_fraction")
             figures = dict(zip(names, (sums / len(batches)).tolist(), strict=True))
             figures["epochs"] = epoch + 1
@@ -255,27 +274,48 @@ class PPO:
         order = torch.randperm(samples, generator=self._generator).to(self.device)
         yield from order.tensor_split(max(1, round(samples / self.config.batch_size)))
 
-    def _update(self, inputs: Encoded, actions: Tensor, old: Tensor, advantage: Tensor, target: Tensor) -> Tensor:
-        """One step of Adam; (4,) policy loss, value loss, approximate KL, share of clipped samples."""
-        config = self.config
-        mean, value = self.network(inputs)
-        log_ratio = log_probability(actions, mean, self.network.log_std) - old
-        surrogate = policy_loss(log_ratio, advantage, config.clip_range)
-        value_loss = (value - target).square().mean()
-        loss = surrogate + config.value_coefficient * value_loss
-        if config.entropy_coefficient:
-            loss = loss - config.entropy_coefficient * self.network.log_std.sum()
-        self.optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.network.parameters(), config.max_gradient)
+    def _update(self, samples: Samples, chosen: Tensor) -> Tensor:
+        """One step of Adam on a minibatch; (4,) policy loss, value loss, approximate KL, share of clipped samples.
+
+        On a CPU each thread takes an equal part of the minibatch through the network and back. Threads within torch's
+        operations wait for each other hundreds of times per minibatch instead, for long if other work keeps a core busy.
+        """
+        parts = chosen.tensor_split(self._parts)
+        results = list(self._pool.map(self._gradients, [samples.rows(part) for part in parts]))
+        shares = [len(part) / len(chosen) for part in parts]
+        for index, parameter in enumerate(self.network.parameters()):
+            parameter.grad = _sum(
+                share * gradients[index] for share, (gradients, _) in zip(shares, results, strict=True)
+            )
+        nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_gradient)
         self.optimizer.step()
+        return _sum(share * figures for share, (_, figures) in zip(shares, results, strict=True))
+
+    def _gradients(self, samples: Samples) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Gradients of the loss by every parameter, and :meth:`_update`'s figures."""
+        config, log_std = self.config, self.network.log_std
+        mean, value = self.network(samples.inputs)
+        log_ratio = log_probability(samples.actions, mean, log_std) - samples.log_probability
+        surrogate = policy_loss(log_ratio, samples.advantage, config.clip_range)
+        value_loss = (value - samples.target).square().mean()
+        loss = surrogate + config.value_coefficient * value_loss - config.entropy_coefficient * log_std.sum()
+        gradients = torch.autograd.grad(loss, list(self.network.parameters()))
         with torch.no_grad():
-            kl = (log_ratio.exp() - 1 - log_ratio).mean()  # http://joschu.net/blog/kl-approx.html
-            clipped = (log_ratio.exp() - 1).abs().gt(config.clip_range).float().mean()
-            return torch.stack([surrogate.detach(), value_loss.detach(), kl, clipped])
+            change = torch.expm1(log_ratio)
+            kl = (change - log_ratio).mean()  # http://joschu.net/blog/kl-approx.html
+            clipped = change.abs().gt(config.clip_range).float().mean()
+            return gradients, torch.stack([surrogate, value_loss, kl, clipped])
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
         self.seconds[stage] += time.perf_counter() - start
+
+
+def _sum(tensors: Iterable[Tensor]) -> Tensor:
+    """The sum of tensors of one shape, from first to last."""
+    first, *others = tensors
+    for other in others:
+        first = first + other
+    return first

@@ -77,7 +77,7 @@ class TrainingConfig:
     processes: int | None = None
     """Worker processes that simulate on the CPU; default: the cores. Results do not depend on it."""
     torch_threads: int = 2
-    """Threads of torch while it learns on a CPU; the simulation waits then. One if other work keeps the cores busy."""
+    """Threads that share each minibatch out while a CPU learns; the simulation waits then."""
 
     def check(self) -> None:
         """Raises InvalidInputError unless every setting is usable. Not done on creation: tyro would box the message."""

@@ -247,6 +247,16 @@ def test_state_carries_all_that_a_chunk_depends_on() -> None:
         assert torch.equal(a, b)
 
 
+def test_threads_share_minibatches_out_and_change_nothing_but_rounding() -> None:
+    (one, first), (two, second), (again, third) = (
+        train(replace(CONFIG, torch_threads=threads), True, 3) for threads in (1, 2, 2)
+    )
+    assert first == pytest.approx(second, rel=1e-3) and second == third
+    pairs = zip(*(each.network.state_dict().values() for each in (one, two, again)), strict=True)
+    for a, b, c in pairs:
+        assert torch.allclose(a, b, atol=2e-3) and torch.equal(b, c)
+
+
 def test_figures_say_what_happened() -> None:
     learner = PPO(replace(CONFIG, target_kl=9.0), Bandit(16, True), make_network("fast", 0.4, seed=0), "cpu")
     learner.begin(3)

@@ -7,7 +7,6 @@ import itertools
 import multiprocessing
 import os
 import selectors
-import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -250,10 +249,13 @@ class TactileVectorEnv(VectorEnv):
     def _collect(self, timeout: float, remedy: str = "make a new environment") -> list[Any]:
         """One answer from every worker, in order; stops all of them and raises if any fails."""
         answers: dict[int, Any] = {}
-        deadline = time.monotonic() + timeout
+        left = timeout
         while len(answers) < len(self._workers):
-            ready = self._selector.select(max(0.0, deadline - time.monotonic()))
-            if not ready:
+            # In slices, so that time during which all processes are stopped (Ctrl-Z, a batch system) does not count.
+            waited = min(left, 1.0)
+            ready = self._selector.select(waited)
+            left -= 0.0 if ready else waited
+            if left <= 0:
                 silent = next(index for index in range(len(self._workers)) if index not in answers)
                 self._stop()
                 raise WorkerError(f"worker {silent}: no answer for {timeout:g} s; all workers were stopped")

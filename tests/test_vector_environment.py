@@ -206,6 +206,28 @@ def test_a_hung_worker_is_found_within_the_timeout(request_name):
         envs.reset()
 
 
+def test_a_run_that_is_stopped_as_a_whole_goes_on():
+    """Ctrl-Z, or a batch system that suspends a job for longer than the workers have to answer."""
+    code = """
+        import numpy as np, tslam_bench
+        if __name__ == "__main__":
+            envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=2, timeout=3.0)
+            envs.reset(seed=0)
+            print("ready", flush=True)
+            for step in range(600):
+                envs.step(np.zeros((2, 28), np.float32))
+            print("done", flush=True)
+    """
+    run = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert run.stdout is not None and run.stdout.readline() == "ready\n"
+    os.killpg(run.pid, signal.SIGSTOP)
+    time.sleep(4.5)
+    os.killpg(run.pid, signal.SIGCONT)
+    assert run.stdout.readline() == "done\n" and run.wait(30) == 0
+
+
 def test_refused_options_harm_nothing():
     envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=1)
     envs.reset(seed=0)

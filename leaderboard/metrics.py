@@ -19,18 +19,65 @@ from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPA
 
 WORST_DISTANCE: Final = math.sqrt(3)
 """Diagonal of the workspace in metric units: the distance an empty prediction is charged, and the cap of all others."""
+CALIBRATION_BINS: Final = 15
+"""Bins of equal volume in the expected calibration error."""
 
 
-def iou(predicted: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
+def iou(predicted: NDArray[np.bool_], true: NDArray[np.bool_], weights: NDArray[np.float64] | None = None) -> float:
     """Intersection over union of two boolean arrays of one shape: ``|A and B| / |A or B|`` in [0, 1].
 
     One side empty: 0. Both empty: 1 (equal sets).
+
+    Args:
+        predicted, true: what is solid, at points or voxels.
+        weights: volume that each point stands for, in any unit; by default all stand for the same.
     """
     predicted, true = np.asarray(predicted, dtype=bool), np.asarray(true, dtype=bool)
     if predicted.shape != true.shape:
         raise ValueError(f"iou: shapes {predicted.shape} and {true.shape} differ")
-    union = np.count_nonzero(predicted | true)
-    return np.count_nonzero(predicted & true) / union if union else 1.0
+    if weights is None:
+        both, either = float(np.count_nonzero(predicted & true)), float(np.count_nonzero(predicted | true))
+    else:
+        if np.shape(weights) != true.shape:
+            raise ValueError(f"iou: {np.shape(weights)} weights for {true.shape} points")
+        both, either = float(np.sum(weights[predicted & true])), float(np.sum(weights[predicted | true]))
+    return both / either if either else 1.0
+
+
+def brier_score(probability: NDArray, true: NDArray[np.bool_], weights: NDArray[np.float64]) -> float:
+    """Mean squared difference of an occupancy probability and the truth, weighted by volume; in [0, 1], 0 is perfect.
+
+    Args:
+        probability: (M,) in [0, 1].
+        true: (M,) bool.
+        weights: (M,) volume that each point stands for.
+    """
+    return float(weights @ np.square(np.asarray(probability, dtype=np.float64) - true) / weights.sum())
+
+
+def calibration_error(
+    probability: NDArray, true: NDArray[np.bool_], weights: NDArray[np.float64], bins: int = CALIBRATION_BINS
+) -> float:
+    """Expected calibration error: how far the probability is from the share that is solid, on average; in [0, 1].
+
+    Points sorted by probability are cut into bins of equal volume. The error is the mean over bins of the distance
+    between mean probability and solid share (Naeini et al., 2015; equal mass: Nguyen and O'Connor, 2015). Points of equal
+    probability that a cut divides share their outcomes evenly, so the order of the points does not matter.
+
+    Args:
+        probability: (M,) in [0, 1], not empty.
+        true: (M,) bool.
+        weights: (M,) volume that each point stands for.
+        bins: number of bins.
+    """
+    values, group = np.unique(np.asarray(probability, dtype=np.float32), return_inverse=True)
+    volume = np.bincount(group, weights)
+    excess = volume * values - np.bincount(group, weights * true)
+    # Between two groups both sums grow in proportion: linear interpolation divides a group evenly.
+    reached = np.concatenate([[0.0], np.cumsum(volume)])
+    summed = np.concatenate([[0.0], np.cumsum(excess)])
+    cuts = np.interp(np.linspace(0, reached[-1], bins + 1), reached, summed)
+    return float(np.abs(np.diff(cuts)).sum() / reached[-1])
 
 
 def sample_surface(

@@ -11,11 +11,11 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
+from tslam_bench.leaderboard.nearest import NearestSamples
 
 WORST_DISTANCE: Final = math.sqrt(3)
 """Diagonal of the workspace in metric units: the distance an empty prediction is charged, and the cap of all others."""
@@ -81,76 +81,39 @@ def calibration_error(
 
 
 def sample_surface(
-    vertices: NDArray, faces: NDArray, count: int, generator: np.random.Generator
+    triangles: NDArray, count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Area-uniform samples of a triangle mesh, with the normals of the faces they lie on.
 
     Args:
-        vertices: (V, 3), any unit.
-        faces: (F, 3) indices, counter-clockwise seen from outside.
+        triangles: (F, 3, 3) corners in any unit, counter-clockwise seen from outside.
         count: number of samples.
         generator: the only source of randomness.
 
     Returns:
-        points (count, 3) in the unit of ``vertices``, unit normals (count, 3).
+        points (count, 3) in the unit of ``triangles``, in the order of the faces; unit normals (count, 3).
 
     Raises:
         ValueError: the mesh has no area.
     """
-    triangles = np.asarray(vertices, dtype=np.float64)[np.asarray(faces, dtype=np.int64)]
+    triangles = np.asarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
     edges_1, edges_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     cross = np.cross(edges_1, edges_2)
     length = np.linalg.norm(cross, axis=1)
     cumulative = np.cumsum(length)
     if len(length) == 0 or not cumulative[-1] > 0:
         raise ValueError("sample_surface: the mesh has no area")
+    # The sums of exponential numbers, divided by the last, are uniform numbers in order: no sorting, and faces that are
+    # neighbours in memory are read one after the other.
+    ordered = np.cumsum(generator.exponential(size=count + 1))
     # side="right" never selects a face of zero area.
-    face = np.searchsorted(cumulative, generator.random(count) * cumulative[-1], side="right")
+    face = np.searchsorted(cumulative, ordered[:-1] / ordered[-1] * cumulative[-1], side="right")
     face = np.minimum(face, np.flatnonzero(length)[-1])  # guards the rounding of the last interval
     u, v = generator.random((2, count, 1))
     folded = u + v > 1
     u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
     points = triangles[face, 0] + u * edges_1[face] + v * edges_2[face]
     return points, cross[face] / length[face, None]
-
-
-class NearestSamples:
-    """Exact nearest neighbours among surface samples.
-
-    A bounding-volume hierarchy, not a k-d tree: the boxes of a k-d tree's splits do not hug a flat face that is parallel
-    to an axis, and a query a few millimetres off such a face then visits most of it (30 times slower on a box). Samples
-    and queries are visited in Morton order, which keeps the memory that neighbours share in the cache (4 times faster).
-    """
-
-    def __init__(self, points: NDArray) -> None:
-        """Args: points: (M, 3), not empty."""
-        points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise ValueError(f"NearestSamples: shape {points.shape}; expected (M, 3) with at least one sample")
-        self._order = morton_order(points)
-        self._sorted = points[self._order]
-        self._elements = np.arange(len(points), dtype=np.int64)[:, None]
-        self._tree = igl.AABB()
-        self._tree.init(self._sorted, self._elements)
-
-    def query(self, other: NearestSamples) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Distance (Q,) from each sample of ``other`` to the nearest of these, and the index (Q,) of that one."""
-        squared, index, _ = self._tree.squared_distance(self._sorted, self._elements, other._sorted)
-        distance, nearest = np.empty(len(squared)), np.empty(len(squared), dtype=np.int64)
-        distance[other._order] = np.sqrt(squared)
-        nearest[other._order] = self._order[index]
-        return distance, nearest
-
-
-def morton_order(points: NDArray) -> NDArray[np.int64]:
-    """Permutation (M,) that sorts ``points`` (M, 3) along a Morton curve of 1024 cells per axis of their bounding box."""
-    low, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-12)
-    cells = np.clip((points - low) / extent * 1023, 0, 1023).astype(np.int64)
-    code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.leaderboard.metrics import sample_surface
 from tslam_bench.reconstruction.volume import Volume
 
@@ -77,19 +78,23 @@ def prepare(
         return _empty("missing", len(points))
     probability = None
     if isinstance(reconstruction, Volume):
-        mesh = reconstruction.to_mesh()
         probability = reconstruction.query(points)
-        if len(mesh.faces) == 0:
-            return _empty("nothing is solid", len(points), probability)
+        try:
+            triangles = reconstruction.triangles()
+        except InvalidInputError as error:
+            return _empty(str(error), len(points), probability)
         solid = probability >= OCCUPANCY_THRESHOLD
     else:
-        mesh = reconstruction
-        reason = invalid_mesh(mesh)
+        reason = invalid_mesh(reconstruction)
         if reason is not None:
             return _empty(reason, len(points))
-        solid = solid_in_mesh(mesh, points)
+        triangles = np.asarray(reconstruction.triangles, dtype=np.float64)
+        solid = solid_in_mesh(reconstruction, points)
     generator = np.random.Generator(np.random.PCG64(SURFACE_SAMPLES_SEED))
-    surface, normals = sample_surface(mesh.vertices, mesh.faces, samples, generator)
+    try:
+        surface, normals = sample_surface(triangles, samples, generator)
+    except ValueError:  # no triangles, or none with an area: a sample alone at the threshold
+        return _empty("nothing is solid", len(points), probability)
     return Prediction(None, solid, probability, surface, normals)
 
 

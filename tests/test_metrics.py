@@ -175,8 +175,8 @@ def test_chamfer_of_parallel_plates() -> None:
     """Two parallel unit squares at distance h: h both ways."""
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    a, _ = metrics.sample_surface(square, faces, 40_000, rng(1))
-    b, _ = metrics.sample_surface(square + np.array([0, 0, 0.1]), faces, 40_000, rng(2))
+    a, _ = metrics.sample_surface(square[faces], 40_000, rng(1))
+    b, _ = metrics.sample_surface(square[faces] + [0, 0, 0.1], 40_000, rng(2))
     match = metrics.match_surfaces(a, b)
     assert metrics.chamfer_l2(match) == pytest.approx(0.01, rel=0.01)
     assert metrics.chamfer_l1(match) == pytest.approx(0.1, rel=0.01)
@@ -209,7 +209,7 @@ def test_normal_consistency_of_voxel_faces_on_a_sphere() -> None:
     E[sum n_i^2] / E[sum |n_i|] = 2/3. No choice of axis-aligned faces can exceed E[max |n_i|] = 0.83."""
     centres = np.linalg.norm(voxel_centres(128), axis=-1)
     mesh = Volume((centres < 0.1).astype(np.float32), "nearest").to_mesh()
-    points, normals = metrics.sample_surface(mesh.vertices, mesh.faces, 60_000, rng(1))
+    points, normals = metrics.sample_surface(mesh.triangles, 60_000, rng(1))
     true, true_normals = sphere_samples(0.1, 60_000, rng(2))
     match = metrics.match_surfaces(points, true)
     value = metrics.normal_consistency(normals, true_normals, match)
@@ -245,7 +245,7 @@ def test_f_score_zero_over_zero_is_zero() -> None:
 
 
 def test_samples_are_area_uniform_and_on_the_surface(box) -> None:
-    points, normals = metrics.sample_surface(box.vertices, box.faces, 60_000, rng(1))
+    points, normals = metrics.sample_surface(box.vertices[box.faces], 60_000, rng(1))
     half = np.ptp(box.vertices, axis=0) / 2
     axis = np.abs(normals).argmax(axis=1)
     np.testing.assert_allclose(
@@ -260,8 +260,8 @@ def test_samples_are_area_uniform_and_on_the_surface(box) -> None:
 def test_samples_are_reproducible_and_skip_degenerate_faces() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]], dtype=float)
     faces = np.array([[0, 1, 3], [0, 1, 2], [0, 3, 1]])  # the first and last have no area
-    a = metrics.sample_surface(vertices, faces, 1000, rng(5))
-    b = metrics.sample_surface(vertices, faces, 1000, rng(5))
+    a = metrics.sample_surface(vertices[faces], 1000, rng(5))
+    b = metrics.sample_surface(vertices[faces], 1000, rng(5))
     np.testing.assert_array_equal(a[0], b[0])
     assert np.isfinite(a[1]).all()
     np.testing.assert_allclose(a[1], [[0, 0, 1]] * 1000)
@@ -269,9 +269,9 @@ def test_samples_are_reproducible_and_skip_degenerate_faces() -> None:
 
 def test_sampling_refuses_a_mesh_without_area() -> None:
     with pytest.raises(ValueError, match="no area"):
-        metrics.sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, rng())
+        metrics.sample_surface(np.zeros((1, 3, 3)), 10, rng())
     with pytest.raises(ValueError, match="no area"):
-        metrics.sample_surface(np.zeros((0, 3)), np.zeros((0, 3)), 10, rng())
+        metrics.sample_surface(np.zeros((0, 3, 3)), 10, rng())
 
 
 # --- Exploration -----------------------------------------------------------------------------------------------
@@ -376,5 +376,5 @@ def test_inverted_mesh_counts_as_empty() -> None:
     assert "inwards" in (prepare(mesh, rng().uniform(-0.1, 0.1, (100, 3))).reason or "")
 
 
-def test_mesh_bound_leaves_room_for_marching_cubes() -> None:
+def test_mesh_bound_leaves_room_for_the_surface_of_a_full_volume() -> None:
     assert np.abs(Volume(np.ones((8, 8, 8))).to_mesh().vertices).max() < MESH_BOUND

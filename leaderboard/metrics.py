@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
@@ -70,12 +71,19 @@ def calibration_error(
         weights: (M,) volume that each point stands for.
         bins: number of bins.
     """
-    values, group = np.unique(np.asarray(probability, dtype=np.float32), return_inverse=True)
-    volume = np.bincount(group, weights)
-    excess = volume * values - np.bincount(group, weights * true)
-    # Between two groups both sums grow in proportion: linear interpolation divides a group evenly.
-    reached = np.concatenate([[0.0], np.cumsum(volume)])
-    summed = np.concatenate([[0.0], np.cumsum(excess)])
+    probability = np.asarray(probability, dtype=np.float32)
+    zero = probability <= 0
+    some = np.flatnonzero(~zero)
+    order = some[np.argsort(probability[some])]  # most of W is at 0 exactly: there is nothing to sort there
+    values = probability[order].astype(np.float64)
+    # Sums up to the end of each group of equal probability, that at 0 first.
+    ends = np.append(values[1:] != values[:-1], True) if len(order) else np.zeros(0, dtype=bool)
+    volume, solid = weights[order], weights[order] * true[order]
+    none = float(weights[zero].sum())
+    reached = np.concatenate([[0.0, none], (none + np.cumsum(volume))[ends]])
+    missed = float(weights[zero & true].sum())
+    summed = np.concatenate([[0.0, -missed], (np.cumsum(volume * values - solid) - missed)[ends]])
+    # Within a group both sums grow in proportion: linear interpolation divides it evenly.
     cuts = np.interp(np.linspace(0, reached[-1], bins + 1), reached, summed)
     return float(np.abs(np.diff(cuts)).sum() / reached[-1])
 
@@ -96,24 +104,62 @@ def sample_surface(
     Raises:
         ValueError: the mesh has no area.
     """
-    triangles = np.asarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
-    edges_1, edges_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(edges_1, edges_2)
-    length = np.linalg.norm(cross, axis=1)
-    cumulative = np.cumsum(length)
-    if len(length) == 0 or not cumulative[-1] > 0:
+    triangles = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+    cumulative = _cumulative_area(triangles)
+    if len(cumulative) == 0 or not cumulative[-1] > 0:
         raise ValueError("sample_surface: the mesh has no area")
-    # The sums of exponential numbers, divided by the last, are uniform numbers in order: no sorting, and faces that are
-    # neighbours in memory are read one after the other.
+    # The sums of exponential numbers, divided by the last, are uniform numbers in order: no search for each, and faces that
+    # are neighbours in memory are read one after the other.
     ordered = np.cumsum(generator.exponential(size=count + 1))
-    # side="right" never selects a face of zero area.
-    face = np.searchsorted(cumulative, ordered[:-1] / ordered[-1] * cumulative[-1], side="right")
-    face = np.minimum(face, np.flatnonzero(length)[-1])  # guards the rounding of the last interval
-    u, v = generator.random((2, count, 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    points = triangles[face, 0] + u * edges_1[face] + v * edges_2[face]
-    return points, cross[face] / length[face, None]
+    return _place(triangles, cumulative, ordered / ordered[-1] * cumulative[-1], generator.random((2, count)))
+
+
+@njit(cache=True)
+def _normal(triangles: NDArray, face: int) -> tuple[float, float, float]:
+    """Cross product of two edges of a triangle."""
+    ax, bx = triangles[face, 1, 0] - triangles[face, 0, 0], triangles[face, 2, 0] - triangles[face, 0, 0]
+    ay, by = triangles[face, 1, 1] - triangles[face, 0, 1], triangles[face, 2, 1] - triangles[face, 0, 1]
+    az, bz = triangles[face, 1, 2] - triangles[face, 0, 2], triangles[face, 2, 2] - triangles[face, 0, 2]
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@njit(cache=True)
+def _cumulative_area(triangles: NDArray) -> NDArray:
+    """Twice the area of each triangle and of all before it: (F,)."""
+    total = 0.0
+    result = np.empty(len(triangles))
+    for face in range(len(triangles)):
+        x, y, z = _normal(triangles, face)
+        total += np.sqrt(x * x + y * y + z * z)
+        result[face] = total
+    return result
+
+
+@njit(cache=True)
+def _place(triangles: NDArray, cumulative: NDArray, reached: NDArray, within: NDArray) -> tuple[NDArray, NDArray]:
+    """Samples and their normals, at cumulative areas ``reached`` in rising order; a face without area holds none."""
+    count = within.shape[1]
+    points, normals = np.empty((count, 3)), np.empty((count, 3))
+    face, chosen = -1, -1
+    below = 0.0
+    x = y = z = length = 1.0
+    for row in range(count):
+        while chosen < 0 or (below <= reached[row] and face < len(cumulative) - 1):
+            face += 1
+            if cumulative[face] > below:
+                chosen, below = face, cumulative[face]
+                x, y, z = _normal(triangles, face)
+                length = np.sqrt(x * x + y * y + z * z)
+        u, v = within[0, row], within[1, row]
+        if u + v > 1:
+            u, v = 1 - u, 1 - v
+        for axis in range(3):
+            corner = triangles[chosen, 0, axis]
+            points[row, axis] = (
+                corner + u * (triangles[chosen, 1, axis] - corner) + v * (triangles[chosen, 2, axis] - corner)
+            )
+        normals[row, 0], normals[row, 1], normals[row, 2] = x / length, y / length, z / length
+    return points, normals
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ from tslam_bench.leaderboard.submission import (
     Submission,
     read_submission,
 )
+from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.sampling import IouPoints
 
 SCORE_VERSION: Final = 2
@@ -90,7 +91,7 @@ class Truth:
         return Truth(prepared, prepared.iou_points(), surface, metrics.TouchCoverage(prepared.surface_points))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def load_truth(name: str, cache: Path | None = None) -> Truth:
     """Ground truth of a test object from the asset cache."""
     return Truth.of(load_object(name, cache=cache))
@@ -256,23 +257,46 @@ def _score_in_process(path: Path, name: str, cache: Path | None) -> list[ObjectS
 
 def score_object(submission: Submission, truth: Truth) -> list[ObjectScore]:
     """Scores of one object, one per seed of the submission."""
-    return [_score_seed(submission, truth, seed) for seed in submission.info.seeds]
+    scorer = _Scorer(truth)
+    return [_score_seed(submission, scorer, seed) for seed in submission.info.seeds]
 
 
-def _score_seed(submission: Submission, truth: Truth, seed: int) -> ObjectScore:
+class _Scorer:
+    """Scores reconstructions of one object; one that equals the one before, as a reference's do, is not scored again."""
+
+    def __init__(self, truth: Truth) -> None:
+        self.truth = truth
+        self._last: tuple[Volume, tuple[dict[str, float | None], str | None]] | None = None
+
+    def score(self, reconstruction: Reconstruction | None) -> tuple[dict[str, float | None], str | None]:
+        if not isinstance(reconstruction, Volume):
+            return score_reconstruction(reconstruction, self.truth)
+        if self._last is None or not _same(self._last[0], reconstruction):
+            self._last = reconstruction, score_reconstruction(reconstruction, self.truth)
+        return self._last[1]
+
+
+def _same(first: Volume, second: Volume) -> bool:
+    return first.interpolation == second.interpolation and np.array_equal(first.probability, second.probability)
+
+
+def _score_seed(submission: Submission, scorer: _Scorer, seed: int) -> ObjectScore:
+    truth = scorer.truth
     name = truth.prepared.name
     rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
     reference = submission.info.privileged and not any(rollouts.values())
     missing = [] if reference else [f"rollout of pose {pose}" for pose, rollout in rollouts.items() if rollout is None]
     touched_step = merge_touched_steps(rollouts)
 
+    total = HORIZON * len(EXPLORATION_ORDER)
+    recall = truth.coverage.recall_curve(touched_step, total)
+    surface = metrics.surface_iou_curve(touched_step, truth.prepared.surface, total)
     poses: dict[str, dict[str, float | None]] = {}
     reasons: dict[str, str | None] = {}
     for count, members in RECONSTRUCTED_POSES.items():
-        steps = np.where(touched_step < count * HORIZON, touched_step, -1)
         touch: dict[str, float | None] = {
-            "surface_iou": metrics.surface_iou(steps >= 0, truth.prepared.surface),
-            "touched_surface_recall": truth.coverage.recall(steps >= 0),
+            "surface_iou": float(surface[count * HORIZON]),
+            "touched_surface_recall": float(recall[count * HORIZON]),
         }
         reconstruction = submission.reconstruction(name, count, seed)
         absent = [pose for pose in members if rollouts[pose] is None]
@@ -282,13 +306,10 @@ def _score_seed(submission: Submission, truth: Truth, seed: int) -> ObjectScore:
         elif absent and not reference:
             reason = f"rollouts of poses {', '.join(map(str, absent))} are missing"
             reconstruction = None
-        shape, found = score_reconstruction(reconstruction, truth)
+        shape, found = scorer.score(reconstruction)
         poses[str(count)] = {**shape, **(dict.fromkeys(touch) if reference else touch)}
         reasons[str(count)] = reason or found
 
-    total = HORIZON * len(EXPLORATION_ORDER)
-    recall = truth.coverage.recall_curve(touched_step, total)
-    surface = metrics.surface_iou_curve(touched_step, truth.prepared.surface, total)
     curve_areas = {
         "exploration_area": metrics.area_under_curve(recall),
         "exploration_surface_iou_area": metrics.area_under_curve(surface),

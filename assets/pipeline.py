@@ -149,8 +149,8 @@ def prepare_object(source: Source, cache: Path | None = None) -> dict[str, Any]:
             raise GateError(f"gate: IoU(hull union, ground truth) {iou:.3f} is below {MIN_HULL_IOU}")
         distances = field.build_field(hulls)
         points, faces = occupancy.surface_samples(ground_truth)
-        cells = iou_cells(*ground_truth.bounds, truth_solid.volume())
-        compared = iou_points(*ground_truth.bounds, cells).points
+        cells = iou_cells(ground_truth.bounds[0], ground_truth.bounds[1], truth_solid.volume())
+        compared = iou_points(ground_truth.bounds[0], ground_truth.bounds[1], cells).points
         solid_points = occupancy.solid_at(compared, ground_truth)
         raw_points = occupancy.solid_at(compared, raw) if filled.volume > 0 else solid_points
         gates: dict[str, Any] = {

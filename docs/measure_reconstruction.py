@@ -28,6 +28,7 @@ from tslam_bench.constants import (
     WORKSPACE_LOW,
 )
 from tslam_bench.errors import BenchmarkError
+from tslam_bench.leaderboard.metrics import iou
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import make_reconstructor
@@ -75,11 +76,6 @@ Command = (
 )
 
 
-def overlap(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
-    """Intersection over union."""
-    return float((first & second).sum() / max(1, (first | second).sum()))
-
-
 def reconstructors(models: tuple[str, ...]) -> dict[str, Reconstructor]:
     """The ones that need no model, and the given models."""
     made = {name: make_reconstructor(name) for name in ("grid", "hull", "mean_shape", "retrieval")}
@@ -96,10 +92,12 @@ def report(title: str, scores: dict[str, list[float]]) -> None:
 
 def score(made: dict[str, Reconstructor], touched: NDArray, visited: NDArray, item: PreparedObject) -> dict[str, float]:
     """IoU of every reconstructor."""
+    sample = item.iou_points()
     return {
-        name: overlap(
-            reconstructor.reconstruct(touched, visited).query(iou_points()) >= OCCUPANCY_THRESHOLD,
+        name: iou(
+            reconstructor.reconstruct(touched, visited).query(sample.points) >= OCCUPANCY_THRESHOLD,
             item.solid_at_iou_points,
+            sample.weights,
         )
         for name, reconstructor in made.items()
     }
@@ -119,11 +117,11 @@ def hull() -> None:
     for (name, gauge), diameter in itertools.product(solids.items(), (0.04, 0.08, 0.12)):
         surface = (gauge(corners[0]) <= diameter / 2) & (gauge(corners[1]) >= diameter / 2)
         volume = HullReconstructor().reconstruct(surface, np.zeros_like(surface))
-        true = gauge(iou_points()) <= diameter / 2
-        predicted = volume.query(iou_points()) >= OCCUPANCY_THRESHOLD
-        print(
-            f"{name:9} {100 * diameter:3.0f} cm: {surface.sum():5} touched voxels, IoU {overlap(predicted, true):.3f}"
-        )
+        sample = iou_points(np.full(3, -diameter / 2), np.full(3, diameter / 2), (50, 50, 50))
+        true = gauge(sample.points) <= diameter / 2
+        predicted = volume.query(sample.points) >= OCCUPANCY_THRESHOLD
+        found = iou(predicted, true, sample.weights)
+        print(f"{name:9} {100 * diameter:3.0f} cm: {surface.sum():5} touched voxels, IoU {found:.3f}")
 
 
 def simulated(command: Simulated) -> None:

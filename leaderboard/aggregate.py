@@ -80,6 +80,16 @@ class Bootstrap:
         )
 
 
+def resampled_means(values: NDArray, samples: int = BOOTSTRAP_SAMPLES) -> NDArray[np.float64]:
+    """Bootstrap distribution of the mean of ``values`` (objects, seeds): (samples,).
+
+    The resamples depend on the shape only, and those of the objects on the number of objects only. So the differences of
+    two results of this function are a paired bootstrap: over objects, and over seeds where both have equally many.
+    """
+    objects, seeds = np.shape(values)
+    return Bootstrap(objects, seeds, samples).resample(values).mean(axis=(1, 2))
+
+
 def interval(samples: NDArray, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Percentile interval of bootstrap ``samples`` (B,)."""
     tail = 50 * (1 - confidence)

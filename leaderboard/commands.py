@@ -25,12 +25,13 @@ from tslam_bench.leaderboard.aggregate import Estimate
 from tslam_bench.leaderboard.page import build_page
 from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.scoring import SubmissionScore, score_submission
-from tslam_bench.leaderboard.submission import INFO_FILE, Submission, read_submission
+from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission
+from tslam_bench.leaderboard.submission import INFO_FILE, RECONSTRUCTED_POSES, Submission, read_submission
 
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"
 PICTURE_FOLDER: Final = ".pictures"
+_SHAPE_HEADS: Final = ("CD-L2\nx1e-2", "CD-L1", "NC", "F 1%", "F 2%", "surf.\nIoU")
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,13 @@ def score_main(arguments: Sequence[str]) -> None:
     if not parsed.submissions:
         raise InvalidInputError("score: name at least one submission, a folder or a zip archive")
     _check_workers(parsed.workers)
+    files = _score_files(parsed.submissions, parsed.output)
     scores = []
-    for path in parsed.submissions:
+    for path, file in zip(parsed.submissions, files, strict=True):
         with _progress(f"score {path.name}", "object") as show:
             scores.append(score_submission(path, parsed.objects or None, parsed.workers, show))
-    if parsed.output is not None:
-        _write_scores(parsed.submissions, scores, parsed.output)
+        if file is not None:
+            write_json(file, scores[-1].to_json())
     if parsed.json:
         values = [score.to_json() for score in scores]
         print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
@@ -197,48 +199,59 @@ def plan_pictures(
 def summary_table(scores: Sequence[SubmissionScore]) -> Table:
     """One row per submission."""
     table = Table(
-        title="Scores after 8 poses (IoU also after 4)", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0)
+        title="Scores: IoU area is the mean of the IoU after 1, 2, 4 and 8 poses; all that names no number is after 8",
+        title_justify="left",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
     )
     table.add_column("method", no_wrap=True)
-    names = ("IoU 4", "IoU 8", "95 %", "CD-L2\nx1e-2", "CD-L1", "NC", "F 1%", "F 2%", "surf.\nIoU", "recall", "area")
-    for name in names:
+    names = ("IoU\narea", "95 %", *(f"IoU {count}" for count in RECONSTRUCTED_POSES), "ECE", *_SHAPE_HEADS)
+    for name in (*names, "recall", "explor.\narea"):
         table.add_column(name, justify="right", no_wrap=name != "95 %")
     for score in scores:
-        at_4, at_8, exploration = (score.aggregate[group] for group in ("4", "8", "exploration"))
-        iou = at_8["iou"]
+        at_8, areas = score.aggregate["8"], score.aggregate["areas"]
+        area = areas["iou_area"]
         table.add_row(
             score.info.method + (" (privileged)" if score.info.privileged else ""),
-            _mean(at_4.get("iou")),
-            _mean(iou),
-            f"{iou.low:.2f}-{iou.high:.2f}",
+            _mean(area),
+            f"{area.low:.2f}-{area.high:.2f}",
+            *(_mean(score.aggregate[str(count)]["iou"]) for count in RECONSTRUCTED_POSES),
+            _mean(at_8.get("calibration_error")),
             _mean(at_8["chamfer_l2"], 4, 100),
             *(_mean(at_8.get(name)) for name in ("chamfer_l1", "normal_consistency", "f_score_1", "f_score_2")),
             *(_mean(at_8.get(name)) for name in ("surface_iou", "touched_surface_recall")),
-            _mean(exploration.get("exploration_area")),
+            _mean(areas.get("exploration_area")),
         )
     return table
 
 
 def object_table(score: SubmissionScore) -> Table:
     """One row per object and seed of one submission."""
-    title = f"{score.info.method}, per object after 8 poses"
+    title = f"{score.info.method}, per object; all that names no number is after 8 poses"
     table = Table(title=title, title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
-    names = ("object", "seed", "IoU", "CD-L2\nx1e-2", "NC", "F 1%", "F 2%", "surf.\nIoU", "recall", "area", "remark")
-    for name in names:
+    names = ("object", "seed", "IoU\narea", *(f"IoU {count}" for count in RECONSTRUCTED_POSES), "ECE", *_SHAPE_HEADS)
+    for name in (*names, "recall", "explor.\narea", "remark"):
         table.add_column(name, justify="left" if name in ("object", "remark") else "right")
     for result in score.results:
-        values = result.protocols["8"]
+        values = result.poses["8"]
         table.add_row(
             result.object,
             str(result.seed),
-            _number(values["iou"]),
+            _number(result.areas["iou_area"]),
+            *(_number(result.poses[str(count)]["iou"]) for count in RECONSTRUCTED_POSES),
+            _number(values["calibration_error"]),
             _number(values["chamfer_l2"], 4, 100),
-            *(_number(values[name]) for name in ("normal_consistency", "f_score_1", "f_score_2")),
+            *(_number(values[name]) for name in ("chamfer_l1", "normal_consistency", "f_score_1", "f_score_2")),
             *(_number(values[name]) for name in ("surface_iou", "touched_surface_recall")),
-            _number(result.exploration["exploration_area"]),
-            result.reasons["8"] or "",
+            _number(result.areas["exploration_area"]),
+            _remark(result),
         )
     return table
+
+
+def _remark(result: ObjectScore) -> str:
+    """Why reconstructions count as empty: "8: missing"."""
+    return "; ".join(f"{count}: {reason}" for count, reason in result.reasons.items() if reason is not None)
 
 
 def _score_missing(
@@ -277,15 +290,16 @@ def _read_score(path: Path) -> SubmissionScore:
     return SubmissionScore.from_json(value, str(path))
 
 
-def _write_scores(paths: Sequence[Path], scores: Sequence[SubmissionScore], output: Path) -> None:
-    if len(scores) == 1:
-        write_json(output / f"{paths[0].stem}.json" if output.is_dir() else output, scores[0].to_json())
-        return
+def _score_files(paths: Sequence[Path], output: Path | None) -> list[Path | None]:
+    """Where the score of each submission goes, or None; known before hours of scoring, not after."""
+    if output is None:
+        return [None] * len(paths)
+    if len(paths) == 1:
+        return [output / f"{paths[0].stem}.json" if output.is_dir() else output]
     names = [path.stem for path in paths]
     if len(set(names)) != len(names):
         raise InvalidInputError("score: two submissions have the same name; write them to different folders")
-    for name, score in zip(names, scores, strict=True):
-        write_json(output / f"{name}.json", score.to_json())
+    return [output / f"{name}.json" for name in names]
 
 
 def _check_workers(workers: int) -> None:

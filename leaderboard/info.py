@@ -159,8 +159,8 @@ class SubmissionInfo:
     def identity(self) -> tuple[object, ...]:
         """What must not change when a submission is resumed."""
         names = ("method", "explorer", "reconstructor", "object_set", "environment_id", "protocol_version")
-        names += ("asset_manifest_sha256", "privileged", "reward_mode", "control_mode", "policy_salt")
-        return tuple(getattr(self, n) for n in names)
+        more = ("asset_manifest_sha256", "privileged", "reward_mode", "control_mode", "policy_salt")
+        return tuple(getattr(self, n) for n in (*names, *more))
 
 
 def parse_info(text: bytes) -> SubmissionInfo:

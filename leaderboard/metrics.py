@@ -11,99 +11,155 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import igl
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
+from tslam_bench.leaderboard.nearest import NearestSamples
 
 WORST_DISTANCE: Final = math.sqrt(3)
 """Diagonal of the workspace in metric units: the distance an empty prediction is charged, and the cap of all others."""
+CALIBRATION_BINS: Final = 15
+"""Bins of equal volume in the expected calibration error."""
 
 
-def iou(predicted: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
+def iou(predicted: NDArray[np.bool_], true: NDArray[np.bool_], weights: NDArray[np.float64] | None = None) -> float:
     """Intersection over union of two boolean arrays of one shape: ``|A and B| / |A or B|`` in [0, 1].
 
     One side empty: 0. Both empty: 1 (equal sets).
+
+    Args:
+        predicted, true: what is solid, at points or voxels.
+        weights: volume that each point stands for, in any unit; by default all stand for the same.
     """
     predicted, true = np.asarray(predicted, dtype=bool), np.asarray(true, dtype=bool)
     if predicted.shape != true.shape:
         raise ValueError(f"iou: shapes {predicted.shape} and {true.shape} differ")
-    union = np.count_nonzero(predicted | true)
-    return np.count_nonzero(predicted & true) / union if union else 1.0
+    if weights is None:
+        both, either = float(np.count_nonzero(predicted & true)), float(np.count_nonzero(predicted | true))
+    else:
+        if np.shape(weights) != true.shape:
+            raise ValueError(f"iou: {np.shape(weights)} weights for {true.shape} points")
+        both, either = float(np.sum(weights[predicted & true])), float(np.sum(weights[predicted | true]))
+    return both / either if either else 1.0
+
+
+def brier_score(probability: NDArray, true: NDArray[np.bool_], weights: NDArray[np.float64]) -> float:
+    """Mean squared difference of an occupancy probability and the truth, weighted by volume; in [0, 1], 0 is perfect.
+
+    Args:
+        probability: (M,) in [0, 1].
+        true: (M,) bool.
+        weights: (M,) volume that each point stands for.
+    """
+    return float(weights @ np.square(np.asarray(probability, dtype=np.float64) - true) / weights.sum())
+
+
+def calibration_error(
+    probability: NDArray, true: NDArray[np.bool_], weights: NDArray[np.float64], bins: int = CALIBRATION_BINS
+) -> float:
+    """Expected calibration error: how far the probability is from the share that is solid, on average; in [0, 1].
+
+    Points sorted by probability are cut into bins of equal volume. The error is the mean over bins of the distance
+    between mean probability and solid share (Naeini et al., 2015; equal mass: Nguyen and O'Connor, 2015). Points of equal
+    probability that a cut divides share their outcomes evenly, so the order of the points does not matter.
+
+    Args:
+        probability: (M,) in [0, 1], not empty.
+        true: (M,) bool.
+        weights: (M,) volume that each point stands for.
+        bins: number of bins.
+    """
+    probability = np.asarray(probability, dtype=np.float32)
+    zero = probability <= 0
+    some = np.flatnonzero(~zero)
+    order = some[np.argsort(probability[some])]  # most of W is at 0 exactly: there is nothing to sort there
+    values = probability[order].astype(np.float64)
+    # Sums up to the end of each group of equal probability, that at 0 first.
+    ends = np.append(values[1:] != values[:-1], True) if len(order) else np.zeros(0, dtype=bool)
+    volume, solid = weights[order], weights[order] * true[order]
+    none = float(weights[zero].sum())
+    reached = np.concatenate([[0.0, none], (none + np.cumsum(volume))[ends]])
+    missed = float(weights[zero & true].sum())
+    summed = np.concatenate([[0.0, -missed], (np.cumsum(volume * values - solid) - missed)[ends]])
+    # Within a group both sums grow in proportion: linear interpolation divides it evenly.
+    cuts = np.interp(np.linspace(0, reached[-1], bins + 1), reached, summed)
+    return float(np.abs(np.diff(cuts)).sum() / reached[-1])
 
 
 def sample_surface(
-    vertices: NDArray, faces: NDArray, count: int, generator: np.random.Generator
+    triangles: NDArray, count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Area-uniform samples of a triangle mesh, with the normals of the faces they lie on.
 
     Args:
-        vertices: (V, 3), any unit.
-        faces: (F, 3) indices, counter-clockwise seen from outside.
+        triangles: (F, 3, 3) corners in any unit, counter-clockwise seen from outside.
         count: number of samples.
         generator: the only source of randomness.
 
     Returns:
-        points (count, 3) in the unit of ``vertices``, unit normals (count, 3).
+        points (count, 3) in the unit of ``triangles``, in the order of the faces; unit normals (count, 3).
 
     Raises:
         ValueError: the mesh has no area.
     """
-    triangles = np.asarray(vertices, dtype=np.float64)[np.asarray(faces, dtype=np.int64)]
-    edges_1, edges_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(edges_1, edges_2)
-    length = np.linalg.norm(cross, axis=1)
-    cumulative = np.cumsum(length)
-    if len(length) == 0 or not cumulative[-1] > 0:
+    triangles = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+    cumulative = _cumulative_area(triangles)
+    if len(cumulative) == 0 or not cumulative[-1] > 0:
         raise ValueError("sample_surface: the mesh has no area")
-    # side="right" never selects a face of zero area.
-    face = np.searchsorted(cumulative, generator.random(count) * cumulative[-1], side="right")
-    face = np.minimum(face, np.flatnonzero(length)[-1])  # guards the rounding of the last interval
-    u, v = generator.random((2, count, 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    points = triangles[face, 0] + u * edges_1[face] + v * edges_2[face]
-    return points, cross[face] / length[face, None]
+    # The sums of exponential numbers, divided by the last, are uniform numbers in order: no search for each, and faces that
+    # are neighbours in memory are read one after the other.
+    ordered = np.cumsum(generator.exponential(size=count + 1))
+    return _place(triangles, cumulative, ordered / ordered[-1] * cumulative[-1], generator.random((2, count)))
 
 
-class NearestSamples:
-    """Exact nearest neighbours among surface samples.
-
-    A bounding-volume hierarchy, not a k-d tree: the boxes of a k-d tree's splits do not hug a flat face that is parallel
-    to an axis, and a query a few millimetres off such a face then visits most of it (30 times slower on a box). Samples
-    and queries are visited in Morton order, which keeps the memory that neighbours share in the cache (4 times faster).
-    """
-
-    def __init__(self, points: NDArray) -> None:
-        """Args: points: (M, 3), not empty."""
-        points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise ValueError(f"NearestSamples: shape {points.shape}; expected (M, 3) with at least one sample")
-        self._order = morton_order(points)
-        self._sorted = points[self._order]
-        self._elements = np.arange(len(points), dtype=np.int64)[:, None]
-        self._tree = igl.AABB()
-        self._tree.init(self._sorted, self._elements)
-
-    def query(self, other: NearestSamples) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Distance (Q,) from each sample of ``other`` to the nearest of these, and the index (Q,) of that one."""
-        squared, index, _ = self._tree.squared_distance(self._sorted, self._elements, other._sorted)
-        distance, nearest = np.empty(len(squared)), np.empty(len(squared), dtype=np.int64)
-        distance[other._order] = np.sqrt(squared)
-        nearest[other._order] = self._order[index]
-        return distance, nearest
+@njit(cache=True)
+def _normal(triangles: NDArray, face: int) -> tuple[float, float, float]:
+    """Cross product of two edges of a triangle."""
+    ax, bx = triangles[face, 1, 0] - triangles[face, 0, 0], triangles[face, 2, 0] - triangles[face, 0, 0]
+    ay, by = triangles[face, 1, 1] - triangles[face, 0, 1], triangles[face, 2, 1] - triangles[face, 0, 1]
+    az, bz = triangles[face, 1, 2] - triangles[face, 0, 2], triangles[face, 2, 2] - triangles[face, 0, 2]
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-def morton_order(points: NDArray) -> NDArray[np.int64]:
-    """Permutation (M,) that sorts ``points`` (M, 3) along a Morton curve of 1024 cells per axis of their bounding box."""
-    low, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-12)
-    cells = np.clip((points - low) / extent * 1023, 0, 1023).astype(np.int64)
-    code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(10):
+@njit(cache=True)
+def _cumulative_area(triangles: NDArray) -> NDArray:
+    """Twice the area of each triangle and of all before it: (F,)."""
+    total = 0.0
+    result = np.empty(len(triangles))
+    for face in range(len(triangles)):
+        x, y, z = _normal(triangles, face)
+        total += np.sqrt(x * x + y * y + z * z)
+        result[face] = total
+    return result
+
+
+@njit(cache=True)
+def _place(triangles: NDArray, cumulative: NDArray, reached: NDArray, within: NDArray) -> tuple[NDArray, NDArray]:
+    """Samples and their normals, at cumulative areas ``reached`` in rising order; a face without area holds none."""
+    count = within.shape[1]
+    points, normals = np.empty((count, 3)), np.empty((count, 3))
+    face, chosen = -1, -1
+    below = 0.0
+    x = y = z = length = 1.0
+    for row in range(count):
+        while chosen < 0 or (below <= reached[row] and face < len(cumulative) - 1):
+            face += 1
+            if cumulative[face] > below:
+                chosen, below = face, cumulative[face]
+                x, y, z = _normal(triangles, face)
+                length = np.sqrt(x * x + y * y + z * z)
+        u, v = within[0, row], within[1, row]
+        if u + v > 1:
+            u, v = 1 - u, 1 - v
         for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+            corner = triangles[chosen, 0, axis]
+            points[row, axis] = (
+                corner + u * (triangles[chosen, 1, axis] - corner) + v * (triangles[chosen, 2, axis] - corner)
+            )
+        normals[row, 0], normals[row, 1], normals[row, 2] = x / length, y / length, z / length
+    return points, normals
 
 
 @dataclass(frozen=True)

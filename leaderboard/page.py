@@ -15,7 +15,7 @@ from tslam_bench.constants import (
     ENVIRONMENT_ID,
     GRID_SIZE,
     HORIZON,
-    IOU_POINTS,
+    IOU_INSIDE_POINTS,
     NUM_POSES,
     PROTOCOL_VERSION,
     SURFACE_SAMPLES,
@@ -54,7 +54,11 @@ class Column:
 
 
 COLUMNS: Final = (
+    Column("1", "iou", "IoU", "1 pose"),
+    Column("2", "iou", "IoU", "2 poses"),
     Column("4", "iou", "IoU", "4 poses"),
+    Column("8", "iou", "IoU", "8 poses"),
+    Column("8", "calibration_error", "ECE", "calibration error", ascending=True),
     Column("8", "chamfer_l2", "Chamfer-L2", "&times;10<sup>&minus;2</sup>", 4, 100, True),
     Column("8", "chamfer_l1", "Chamfer-L1", "", 4, 1, True),
     Column("8", "normal_consistency", "Normal", "consistency"),
@@ -62,7 +66,7 @@ COLUMNS: Final = (
     Column("8", "f_score_2", "F-score", "at 2 %"),
     Column("8", "surface_iou", "Surface IoU", "touched voxels"),
     Column("8", "touched_surface_recall", "Recall", "touched surface"),
-    Column("exploration", "exploration_area", "Exploration", "area under curve"),
+    Column("areas", "exploration_area", "Exploration", "area under curve"),
 )
 
 
@@ -116,7 +120,7 @@ def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
         version=escape(leaderboard["package_version"]),
         horizon=HORIZON,
         total_steps=f"{HORIZON * NUM_POSES:,}",
-        iou_points=f"{IOU_POINTS:,}",
+        inside_points=f"{IOU_INSIDE_POINTS:,}",
         surface_samples=f"{SURFACE_SAMPLES:,}",
     )
 
@@ -213,7 +217,7 @@ def _ranking(table: Mapping[str, Any], number: int) -> str:
         '<th scope="col" class="rank" data-sort="ascending">#</th>',
         '<th scope="col" class="first" data-sort="ascending">Explorer</th>',
         '<th scope="col" class="left" data-sort="ascending">Reconstructor</th>',
-        '<th scope="col" data-sort="descending" aria-sort="descending">IoU<small>8 poses, 95 %</small></th>',
+        '<th scope="col" data-sort="descending" aria-sort="descending">IoU area<small>95 %</small></th>',
     ]
     for column in COLUMNS:
         order = "ascending" if column.ascending else "descending"
@@ -227,8 +231,9 @@ def _ranking(table: Mapping[str, Any], number: int) -> str:
     ]
     rows = "\n".join(_ranking_row(entry, number) for entry in entries)
     return f"""{_callouts(table)}
-<p>Ranked by IoU after 8 poses over {_set_name(table)}; ties by Chamfer-L2, then by exploration area. Entries that saw or were
-rewarded with the true shape stand where their score puts them, without a rank.</p>
+<p>Ordered by IoU area, the mean of the IoU after 1, 2, 4 and 8 poses, over {_set_name(table)}; ties by IoU after 8 poses, then by
+Chamfer-L2. Entries share a rank with the first of their group if the 95 % interval of their paired difference holds 0. Entries
+that saw or were rewarded with the true shape stand where their score puts them, without a rank.</p>
 {controls}
 <div class="scroll" tabindex="0" role="region" aria-label="Ranking table, scrolls sideways">
 <table class="ranking sortable" data-table="ranking{number}">
@@ -237,8 +242,8 @@ rewarded with the true shape stand where their score puts them, without a rank.<
 <tbody>
 {rows}
 </tbody></table></div>
-<p class="note">All columns but the first IoU are after 8 poses; distances are in units of the workspace edge (0.25 m). The range
-below IoU and the marks on its bar are the 95 % bootstrap interval. &ldquo;Not replayed&rdquo;: the stored actions were not
+<p class="note">Columns that name no number of poses are after 8; distances are in units of the workspace edge (0.25 m). The range
+below IoU area and the marks on its bar are the 95 % bootstrap interval. &ldquo;Not replayed&rdquo;: the stored actions were not
 simulated again, so the touches are the submitter&rsquo;s word.</p>
 {_remarks(entries, number)}"""
 
@@ -261,17 +266,17 @@ def _ranking_row(entry: Mapping[str, Any], number: int) -> str:
     small = "".join(f"<small>{remark}</small>" for remark in remarks if remark)
     if entry["notes"]:
         small += f'<small><a href="#remarks-{number}">see remarks</a></small>'
-    iou = entry["aggregate"]["8"]["iou"]
+    area = entry["aggregate"]["areas"]["iou_area"]
     cells = [
         f'<td class="rank" data-value="{rank or ""}">{rank or "&ndash;"}</td>',
         f'<th scope="row" data-value="{escape(info["explorer"])}">{_name(info["explorer"])}{badge}{small}</th>',
         f'<td class="left" data-value="{escape(info["reconstructor"])}">{escape(info["reconstructor"])}</td>',
-        f'<td class="key" data-value="{iou["mean"]:.6f}">{iou["mean"]:.3f}<small>{iou["low"]:.3f}&ndash;{iou["high"]:.3f}</small>'
-        f"{_bar(iou)}</td>",
+        f'<td class="key" data-value="{area["mean"]:.6f}">{area["mean"]:.3f}'
+        f"<small>{area['low']:.3f}&ndash;{area['high']:.3f}</small>{_bar(area)}</td>",
     ]
     for column in COLUMNS:
-        estimate = entry["aggregate"][column.group].get(column.metric)
-        cells.append(_figure(None if estimate is None else column.factor * estimate["mean"], column.digits))
+        mean = _mean_of(entry, column.group, column.metric)
+        cells.append(_figure(None if mean is None else column.factor * mean, column.digits))
     cells.append(_figure(entry["improvement"], 2))
     training = info["training"]
     steps, hours = training["steps"], training["wall_time_hours"]
@@ -336,17 +341,16 @@ def _exploration(explorers: Sequence[Explorer], spacing: int) -> str:
     )
     counts = list(RECONSTRUCTED_POSES)
     panels = []
-    values = [entry["poses"][str(n)]["iou"] or 0.0 for e in explorers for entry in e.entries for n in counts]
+    values = [entry["aggregate"][str(n)]["iou"]["mean"] for e in explorers for entry in e.entries for n in counts]
     top = max(0.2, math.ceil(5 * max(values) - 1e-9) / 5)
     entries = [(explorer, entry) for explorer in explorers for entry in explorer.entries]
     for reconstructor in sorted({entry["submission"]["reconstructor"] for _, entry in entries}):
         chosen = []
         for explorer, entry in entries:
             if entry["submission"]["reconstructor"] == reconstructor:
-                found = [(position, entry["poses"][str(n)]["iou"]) for position, n in enumerate(counts)]
-                points = [(float(position), value) for position, value in found if value is not None]
-                if len(points) > 1:
-                    chosen.append(Line(explorer.label, explorer.colour, points, dashed=explorer.privileged))
+                found = enumerate(entry["aggregate"][str(n)]["iou"]["mean"] for n in counts)
+                points = [(float(position), value) for position, value in found]
+                chosen.append(Line(explorer.label, explorer.colour, points, dashed=explorer.privileged))
         if len(chosen) > 1:
             panel = line_chart(
                 f"IoU after 1, 2, 4 and 8 poses, reconstructor {reconstructor}",
@@ -379,8 +383,8 @@ def _curve_table(explorers: Sequence[Explorer], counts: Sequence[int]) -> str:
     head = "".join(f'<th scope="col">{n} pose{"s" if n > 1 else ""}</th>' for n in counts)
     rows = "".join(
         f'<tr><th scope="row">{escape(e.label)}</th>'
-        + "".join(_figure(e.entries[0]["poses"][str(n)]["touched_surface_recall"], 3) for n in counts)
-        + _figure(_mean_of(e.entries[0], "exploration_area"), 3)
+        + "".join(_figure(_mean_of(e.entries[0], str(n), "touched_surface_recall"), 3) for n in counts)
+        + _figure(_mean_of(e.entries[0], "areas", "exploration_area"), 3)
         + "</tr>"
         for e in explorers
     )
@@ -399,14 +403,14 @@ def _per_object(table: Mapping[str, Any]) -> str:
         info = entry["submission"]
         cells = "".join(
             f'<td class="cell" style="--v:{value:.3f}" data-value="{value:.6f}">{value:.2f}</td>'
-            for value in (entry["per_object"][name]["8"]["iou"] for name in objects)
+            for value in (entry["per_object"][name]["areas"]["iou_area"] for name in objects)
         )
         label = f"{_name(info['explorer'])} <small>+ {escape(info['reconstructor'])}</small>"
         rows.append(
             f'<tr><td class="rank" data-value="{entry["rank"] or ""}">{entry["rank"] or "&ndash;"}</td>'
             f'<th scope="row" data-value="{escape(info["explorer"])}">{label}</th>{cells}</tr>'
         )
-    return f"""<p>IoU after 8 poses for every object (mean over seeds).</p>
+    return f"""<p>IoU area for every object (mean over seeds).</p>
 <div class="scroll" tabindex="0" role="region" aria-label="Results per object, scrolls sideways">
 <table class="ranking heat sortable">
 <thead><tr><th scope="col" class="rank" data-sort="ascending">#</th>
@@ -490,8 +494,8 @@ def _figure(value: float | None, digits: int) -> str:
     return f'<td data-value="{value:.8f}">{value:.{digits}f}</td>'
 
 
-def _mean_of(entry: Mapping[str, Any], metric: str) -> float | None:
-    estimate = entry["aggregate"]["exploration"].get(metric)
+def _mean_of(entry: Mapping[str, Any], group: str, metric: str) -> float | None:
+    estimate = entry["aggregate"][group].get(metric)
     return None if estimate is None else estimate["mean"]
 
 

@@ -11,11 +11,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.leaderboard.metrics import sample_surface
 from tslam_bench.reconstruction.volume import Volume
 
-SURFACE_SAMPLES_SEED: Final = 20211109
-"""Seed of the samples on every predicted surface."""
+SURFACE_SAMPLES_SEED: Final = 20211112
+"""Seed of the samples on every predicted surface; another one than that of the true surfaces' samples, so that a surface
+compared with itself has the distance of two samplings."""
 MESH_BOUND: Final = WORKSPACE_EDGE / 2 + VOXEL_EDGE
 """Largest absolute coordinate of a valid mesh prediction (m): W and one voxel more."""
 
@@ -27,11 +29,13 @@ class Prediction:
     Attributes:
         reason: why the prediction counts as empty; None if it does not.
         solid: (M,) bool at the points asked for.
+        probability: (M,) float32 at the points asked for; None if there is none: a mesh, or no reconstruction.
         points, normals: (N, 3) area-uniform surface samples (m, object frame) and unit normals; (0, 3) if empty.
     """
 
     reason: str | None
     solid: NDArray[np.bool_]
+    probability: NDArray[np.float32] | None
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
 
@@ -72,21 +76,27 @@ def prepare(
     """
     if reconstruction is None:
         return _empty("missing", len(points))
+    probability = None
     if isinstance(reconstruction, Volume):
-        mesh = reconstruction.to_mesh()
-        if len(mesh.faces) == 0:
-            return _empty("nothing is solid", len(points))
-        solid = reconstruction.query(points) >= OCCUPANCY_THRESHOLD
+        probability = reconstruction.query(points)
+        try:
+            triangles = reconstruction.triangles()
+        except InvalidInputError as error:
+            return _empty(str(error), len(points), probability)
+        solid = probability >= OCCUPANCY_THRESHOLD
     else:
-        mesh = reconstruction
-        reason = invalid_mesh(mesh)
+        reason = invalid_mesh(reconstruction)
         if reason is not None:
             return _empty(reason, len(points))
-        solid = solid_in_mesh(mesh, points)
+        triangles = np.asarray(reconstruction.triangles, dtype=np.float64)
+        solid = solid_in_mesh(reconstruction, points)
     generator = np.random.Generator(np.random.PCG64(SURFACE_SAMPLES_SEED))
-    surface, normals = sample_surface(mesh.vertices, mesh.faces, samples, generator)
-    return Prediction(None, solid, surface, normals)
+    try:
+        surface, normals = sample_surface(triangles, samples, generator)
+    except ValueError:  # no triangles, or none with an area: a sample alone at the threshold
+        return _empty("nothing is solid", len(points), probability)
+    return Prediction(None, solid, probability, surface, normals)
 
 
-def _empty(reason: str, count: int) -> Prediction:
-    return Prediction(reason, np.zeros(count, dtype=bool), np.zeros((0, 3)), np.zeros((0, 3)))
+def _empty(reason: str, count: int, probability: NDArray[np.float32] | None = None) -> Prediction:
+    return Prediction(reason, np.zeros(count, dtype=bool), probability, np.zeros((0, 3)), np.zeros((0, 3)))

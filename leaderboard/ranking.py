@@ -1,7 +1,9 @@
 """From score files to a ranking: one table per set of objects (protocol section 12).
 
-Rank: IoU at 8 poses, ties by Chamfer-L2 at 8 poses, then by exploration area. Entries that used privileged information are
-listed where their score puts them, without a rank.
+Order: IoU area, then IoU at 8 poses, then Chamfer-L2 at 8 poses. Rank: going down the table, an entry shares the rank of
+the leader of the current group if the 95 % interval of their paired difference in IoU area holds 0; otherwise it leads the
+next group, and its rank counts all ranked entries above it. Entries that used privileged information are listed where their
+score puts them, without a rank, and lead no group.
 """
 
 from __future__ import annotations
@@ -14,10 +16,11 @@ import numpy as np
 
 from tslam_bench import __version__
 from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
-from tslam_bench.leaderboard.aggregate import probability_of_improvement
+from tslam_bench.leaderboard.aggregate import interval, probability_of_improvement, resampled_means
 from tslam_bench.leaderboard.scoring import CURVE_SPACING, SubmissionScore, object_set
+from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES
 
-LEADERBOARD_VERSION: Final = 1
+LEADERBOARD_VERSION: Final = 2
 """Version of the layout of leaderboard.json."""
 REFERENCE_EXPLORER: Final = "heuristic"
 """Explorer over which the probability of improvement is given."""
@@ -53,12 +56,10 @@ def _table(group: Sequence[SubmissionScore]) -> dict[str, Any]:
     ordered = sorted(group, key=_sort_key)
     objects = ordered[0].objects
     name = ordered[0].info.object_set
-    entries = []
-    position = 0
-    for score in ordered:
-        if not score.info.privileged:
-            position += 1
-        entries.append(_entry(score, None if score.info.privileged else position, group))
+    entries = [
+        _entry(score, position, difference, group)
+        for score, (position, difference) in zip(ordered, shared_ranks(ordered), strict=True)
+    ]
     return {
         "object_set": name if set(objects) == set(object_set(name)) else "custom",
         "objects": sorted(objects),
@@ -66,21 +67,54 @@ def _table(group: Sequence[SubmissionScore]) -> dict[str, Any]:
     }
 
 
+def shared_ranks(ordered: Sequence[SubmissionScore]) -> list[tuple[int | None, dict[str, float] | None]]:
+    """Rank of every entry, and how far it is behind the leader of its group.
+
+    Args:
+        ordered: scores on the same objects, best first.
+
+    Returns:
+        for each score its rank (None if privileged), and ``mean``, ``low``, ``high`` of the difference in IoU area between
+        the leader whose interval it was tested against and itself; None for who leads the first group, and for privileged
+        entries.
+    """
+    ranks: list[tuple[int | None, dict[str, float] | None]] = []
+    leader: tuple[int, float, np.ndarray] | None = None
+    above = 0
+    for score in ordered:
+        if score.info.privileged:
+            ranks.append((None, None))
+            continue
+        matrix = _area_matrix(score)
+        mean, drawn = float(matrix.mean()), resampled_means(matrix)
+        difference = None
+        if leader is not None:
+            low, high = interval(leader[2] - drawn)
+            difference = {"mean": leader[1] - mean, "low": low, "high": high}
+        if leader is None or difference is None or not difference["low"] <= 0 <= difference["high"]:
+            leader = (above + 1, mean, drawn)
+        ranks.append((leader[0], difference))
+        above += 1
+    return ranks
+
+
 def _sort_key(score: SubmissionScore) -> tuple[Any, ...]:
     at_8 = score.aggregate["8"]
-    area = score.aggregate["exploration"].get("exploration_area")
     # Names last, so that the order never depends on the order of the files.
     names = (score.info.explorer, score.info.reconstructor, score.info.method, score.content_hash)
-    return (-at_8["iou"].mean, at_8["chamfer_l2"].mean, -(area.mean if area else 0.0), *names)
+    return (-score.aggregate["areas"]["iou_area"].mean, -at_8["iou"].mean, at_8["chamfer_l2"].mean, *names)
 
 
-def _entry(score: SubmissionScore, position: int | None, group: Sequence[SubmissionScore]) -> dict[str, Any]:
+def _entry(
+    score: SubmissionScore, position: int | None, difference: dict[str, float] | None, group: Sequence[SubmissionScore]
+) -> dict[str, Any]:
     objects = sorted(score.objects)
     results: dict[str, list[Any]] = {name: [] for name in objects}
     for result in score.results:
         results[result.object].append(result)
     return {
         "rank": position,
+        "behind_leader": difference,
         "submission": score.info.to_json(),
         "content_hash": score.content_hash,
         "verified": score.verified,
@@ -91,16 +125,10 @@ def _entry(score: SubmissionScore, position: int | None, group: Sequence[Submiss
         "improvement": _improvement(score, group),
         "per_object": {
             name: {
-                protocol: {
-                    metric: _mean([r.protocols[protocol][metric] for r in rows]) for metric in rows[0].protocols["8"]
-                }
-                for protocol in ("4", "8")
+                "areas": _means([r.areas for r in rows]),
+                **{str(count): _means([r.poses[str(count)] for r in rows]) for count in RECONSTRUCTED_POSES},
             }
             for name, rows in results.items()
-        },
-        "poses": {
-            count: {metric: _mean([r.poses[count][metric] for r in score.results]) for metric in values}
-            for count, values in score.results[0].poses.items()
         },
         "recall_curve": _mean_curve([r.recall_curve for r in score.results]),
         "surface_iou_curve": _mean_curve([r.surface_iou_curve for r in score.results]),
@@ -109,7 +137,7 @@ def _entry(score: SubmissionScore, position: int | None, group: Sequence[Submiss
 
 
 def _improvement(score: SubmissionScore, group: Sequence[SubmissionScore]) -> float | None:
-    """Probability of improvement in IoU at 8 poses over the reference explorer with the same reconstructor, or None."""
+    """Probability of improvement in IoU area over the reference explorer with the same reconstructor, or None."""
     if score.info.explorer == REFERENCE_EXPLORER:
         return None
     same = [
@@ -118,11 +146,17 @@ def _improvement(score: SubmissionScore, group: Sequence[SubmissionScore]) -> fl
     if not same:
         return None
     reference = min(same, key=_sort_key)
-    return probability_of_improvement(_iou_matrix(score), _iou_matrix(reference))
+    return probability_of_improvement(_area_matrix(score), _area_matrix(reference))
 
 
-def _iou_matrix(score: SubmissionScore) -> np.ndarray:
-    return score.matrix("iou", 8)[np.argsort(score.objects)]
+def _area_matrix(score: SubmissionScore) -> np.ndarray:
+    """IoU area (objects, seeds) in the order of their names and numbers, so that entries can be paired."""
+    matrix = score.matrix("areas", "iou_area")
+    return matrix[np.argsort(score.objects)][:, np.argsort(score.info.seeds)]
+
+
+def _means(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
+    return {metric: _mean([row[metric] for row in rows]) for metric in rows[0]}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -1,4 +1,4 @@
-"""Scores of a submission: every object, seed and protocol, then aggregated (protocol sections 10 and 12).
+"""Scores of a submission: every object, seed and number of poses, then aggregated (protocol sections 10 and 12).
 
 Rollouts are not replayed: a score says ``verified: false`` until something has simulated the stored actions again.
 """
@@ -27,7 +27,6 @@ from tslam_bench.constants import (
     F_SCORE_DISTANCES,
     GRID_SIZE,
     HORIZON,
-    PROTOCOL_POSES,
     PROTOCOL_VERSION,
     QUICK_OBJECTS,
     VOXEL_EDGE,
@@ -45,9 +44,10 @@ from tslam_bench.leaderboard.submission import (
     Submission,
     read_submission,
 )
-from tslam_bench.sampling import iou_points
+from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.sampling import IouPoints
 
-SCORE_VERSION: Final = 1
+SCORE_VERSION: Final = 2
 """Version of the score file's layout."""
 CURVE_SPACING: Final = 10
 """Control steps between the stored samples of an exploration curve."""
@@ -66,11 +66,13 @@ SHAPE_METRICS: Final = {
     "f_score_2": 0.0,
 }
 """Metrics of a reconstruction -> worst value, which an empty prediction is given. Metric units, squared or plain."""
+CALIBRATION_METRICS: Final = {"calibration_error": 1.0, "brier": 1.0}
+"""Metrics of a volume's probability -> worst value, which a missing reconstruction is given. A mesh has none."""
 TOUCH_METRICS: Final = ("surface_iou", "touched_surface_recall")
 """Metrics of the merged touched voxels."""
-EXPLORATION_METRICS: Final = ("exploration_area", "exploration_surface_iou_area")
-"""Areas under the curves of recall and of surface IoU over all eight poses."""
-LOWER_IS_BETTER: Final = ("chamfer_l2", "chamfer_l1")
+AREAS: Final = ("iou_area", "exploration_area", "exploration_surface_iou_area")
+"""Mean of the IoU after 1, 2, 4 and 8 poses, by which entries are ranked; areas under the curves of recall and of surface
+IoU over the steps of all eight poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,7 @@ class Truth:
     """Ground truth of one object with what is computed once for all submissions."""
 
     prepared: PreparedObject
+    iou_points: IouPoints
     surface: metrics.NearestSamples
     coverage: metrics.TouchCoverage
 
@@ -85,10 +88,10 @@ class Truth:
     def of(prepared: PreparedObject) -> Truth:
         """Ground truth from a prepared object."""
         surface = metrics.NearestSamples(metrics.to_metric(prepared.surface_points))
-        return Truth(prepared, surface, metrics.TouchCoverage(prepared.surface_points))
+        return Truth(prepared, prepared.iou_points(), surface, metrics.TouchCoverage(prepared.surface_points))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def load_truth(name: str, cache: Path | None = None) -> Truth:
     """Ground truth of a test object from the asset cache."""
     return Truth.of(load_object(name, cache=cache))
@@ -100,24 +103,22 @@ class ObjectScore:
 
     Attributes:
         object, seed: what was scored.
-        protocols: ``"4"`` and ``"8"`` -> metric -> value; touch metrics are None for a reference without rollouts.
-        reasons: ``"4"`` and ``"8"`` -> why the reconstruction counts as empty, or None.
-        poses: ``"1"``, ``"2"``, ``"4"``, ``"8"`` -> recall and surface IoU after so many poses of the exploration
-            order, and IoU where a reconstruction is there.
+        poses: ``"1"``, ``"2"``, ``"4"``, ``"8"`` -> metric -> value after so many poses of the exploration order; touch
+            metrics are None for a reference without rollouts, calibration metrics are None for a mesh.
+        reasons: the same keys -> why the reconstruction counts as empty, or None.
+        areas: ``AREAS``; those of the curves (from every step) are None for a reference without rollouts.
         recall_curve, surface_iou_curve: values every ``CURVE_SPACING`` control steps over all eight poses, from step 0.
-        exploration: areas under the two curves (from every step).
         implausible_touches: share of touched voxels that cannot hold a point of the object's surface.
-        missing: files of the protocols that the submission lacks.
+        missing: rollouts and reconstructions that the submission lacks.
     """
 
     object: str
     seed: int
-    protocols: dict[str, dict[str, float | None]]
-    reasons: dict[str, str | None]
     poses: dict[str, dict[str, float | None]]
+    reasons: dict[str, str | None]
+    areas: dict[str, float | None]
     recall_curve: list[float]
     surface_iou_curve: list[float]
-    exploration: dict[str, float | None]
     implausible_touches: float
     missing: list[str]
 
@@ -132,7 +133,8 @@ class SubmissionScore:
         objects: names, in the order of scoring.
         asset_sha256: hash of the objects' products that were scored against.
         results: one per object and seed.
-        aggregate: ``"4"``, ``"8"`` and ``"exploration"`` -> metric -> estimate over objects and seeds.
+        aggregate: ``"areas"`` and ``"1"``, ``"2"``, ``"4"``, ``"8"`` (poses) -> metric -> estimate over objects and seeds;
+            without the metrics that some result lacks.
         notes: one line each: what a reader of the figures should know.
         verified: whether its rollouts were replayed and reproduced.
     """
@@ -146,9 +148,9 @@ class SubmissionScore:
     notes: tuple[str, ...]
     verified: bool = False
 
-    def matrix(self, metric: str, protocol: int) -> NDArray[np.float64]:
-        """Values of one metric: (objects, seeds)."""
-        values = [result.protocols[str(protocol)][metric] for result in self.results]
+    def matrix(self, group: str, metric: str) -> NDArray[np.float64]:
+        """Values of one metric: (objects, seeds). ``group`` is a key of ``aggregate``."""
+        values = [(result.areas if group == "areas" else result.poses[group])[metric] for result in self.results]
         return np.array(values, dtype=np.float64).reshape(len(self.objects), -1)
 
     def to_json(self) -> dict[str, Any]:
@@ -255,79 +257,107 @@ def _score_in_process(path: Path, name: str, cache: Path | None) -> list[ObjectS
 
 def score_object(submission: Submission, truth: Truth) -> list[ObjectScore]:
     """Scores of one object, one per seed of the submission."""
-    return [_score_seed(submission, truth, seed) for seed in submission.info.seeds]
+    scorer = _Scorer(truth)
+    return [_score_seed(submission, scorer, seed) for seed in submission.info.seeds]
 
 
-def _score_seed(submission: Submission, truth: Truth, seed: int) -> ObjectScore:
+class _Scorer:
+    """Scores reconstructions of one object; one that equals the one before, as a reference's do, is not scored again."""
+
+    def __init__(self, truth: Truth) -> None:
+        self.truth = truth
+        self._last: tuple[Volume, tuple[dict[str, float | None], str | None]] | None = None
+
+    def score(self, reconstruction: Reconstruction | None) -> tuple[dict[str, float | None], str | None]:
+        if not isinstance(reconstruction, Volume):
+            return score_reconstruction(reconstruction, self.truth)
+        if self._last is None or not _same(self._last[0], reconstruction):
+            self._last = reconstruction, score_reconstruction(reconstruction, self.truth)
+        return self._last[1]
+
+
+def _same(first: Volume, second: Volume) -> bool:
+    return first.interpolation == second.interpolation and np.array_equal(first.probability, second.probability)
+
+
+def _score_seed(submission: Submission, scorer: _Scorer, seed: int) -> ObjectScore:
+    truth = scorer.truth
     name = truth.prepared.name
     rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
     reference = submission.info.privileged and not any(rollouts.values())
     missing = [] if reference else [f"rollout of pose {pose}" for pose, rollout in rollouts.items() if rollout is None]
     touched_step = merge_touched_steps(rollouts)
 
-    protocols, reasons, poses = {}, {}, {}
-    for count, members in RECONSTRUCTED_POSES.items():
-        steps = np.where(touched_step < count * HORIZON, touched_step, -1)
-        touch: dict[str, float | None] = {
-            "surface_iou": metrics.surface_iou(steps >= 0, truth.prepared.surface),
-            "touched_surface_recall": truth.coverage.recall(steps >= 0),
-        }
-        if reference:
-            touch = dict.fromkeys(touch)
-        reconstruction = submission.reconstruction(name, count, seed)
-        absent = [pose for pose in members if rollouts[pose] is None]
-        shape: dict[str, float | None] = {}
-        if count in PROTOCOL_POSES:
-            reason = None
-            if reconstruction is None:
-                missing.append(f"reconstruction of {count} poses")
-            elif absent and not reference:
-                reason = f"rollouts of poses {', '.join(map(str, absent))} are missing"
-                reconstruction = None
-            values, found = score_reconstruction(reconstruction, truth)
-            shape = dict(values)
-            protocols[str(count)], reasons[str(count)] = {**shape, **touch}, reason or found
-        elif reconstruction is not None and (reference or not absent):
-            solid = prepare(reconstruction, iou_points(), samples=0).solid
-            shape = {"iou": metrics.iou(solid, truth.prepared.solid_at_iou_points)}
-        poses[str(count)] = {**touch, "iou": shape.get("iou")}
-
     total = HORIZON * len(EXPLORATION_ORDER)
     recall = truth.coverage.recall_curve(touched_step, total)
     surface = metrics.surface_iou_curve(touched_step, truth.prepared.surface, total)
-    areas: dict[str, float | None] = {
+    poses: dict[str, dict[str, float | None]] = {}
+    reasons: dict[str, str | None] = {}
+    for count, members in RECONSTRUCTED_POSES.items():
+        touch: dict[str, float | None] = {
+            "surface_iou": float(surface[count * HORIZON]),
+            "touched_surface_recall": float(recall[count * HORIZON]),
+        }
+        reconstruction = submission.reconstruction(name, count, seed)
+        absent = [pose for pose in members if rollouts[pose] is None]
+        reason = None
+        if reconstruction is None:
+            missing.append(f"reconstruction of {count} pose{'s' if count > 1 else ''}")
+        elif absent and not reference:
+            reason = f"rollouts of poses {', '.join(map(str, absent))} are missing"
+            reconstruction = None
+        shape, found = scorer.score(reconstruction)
+        poses[str(count)] = {**shape, **(dict.fromkeys(touch) if reference else touch)}
+        reasons[str(count)] = reason or found
+
+    curve_areas = {
         "exploration_area": metrics.area_under_curve(recall),
         "exploration_surface_iou_area": metrics.area_under_curve(surface),
     }
     return ObjectScore(
         object=name,
         seed=seed,
-        protocols=protocols,
-        reasons=reasons,
         poses=poses,
+        reasons=reasons,
+        areas={
+            "iou_area": float(np.mean([values["iou"] for values in poses.values()])),
+            **(dict.fromkeys(curve_areas) if reference else curve_areas),
+        },
         recall_curve=[] if reference else [round(float(x), 5) for x in recall[::CURVE_SPACING]],
         surface_iou_curve=[] if reference else [round(float(x), 5) for x in surface[::CURVE_SPACING]],
-        exploration=dict.fromkeys(areas) if reference else areas,
         implausible_touches=implausible_touches(touched_step >= 0, truth.prepared),
         missing=missing,
     )
 
 
-def score_reconstruction(reconstruction: Reconstruction | None, truth: Truth) -> tuple[dict[str, float], str | None]:
-    """Shape metrics of one reconstruction, and why it counts as empty (or None)."""
-    prepared = truth.prepared
-    prediction = prepare(reconstruction, iou_points())
+def score_reconstruction(
+    reconstruction: Reconstruction | None, truth: Truth
+) -> tuple[dict[str, float | None], str | None]:
+    """Shape and calibration metrics of one reconstruction, and why it counts as empty (or None)."""
+    prepared, weights = truth.prepared, truth.iou_points.weights
+    prediction = prepare(reconstruction, truth.iou_points.points)
+    if reconstruction is None:
+        calibration: dict[str, float | None] = dict(CALIBRATION_METRICS)
+    elif prediction.probability is None:
+        calibration = dict.fromkeys(CALIBRATION_METRICS)
+    else:
+        at_points = (prediction.probability, prepared.solid_at_iou_points, weights)
+        calibration = {
+            "calibration_error": metrics.calibration_error(*at_points),
+            "brier": metrics.brier_score(*at_points),
+        }
     if prediction.reason is not None:
-        return dict(SHAPE_METRICS), prediction.reason
+        return {**SHAPE_METRICS, **calibration}, prediction.reason
     match = metrics.match_surfaces(metrics.to_metric(prediction.points), truth.surface)
     return {
-        "iou": metrics.iou(prediction.solid, prepared.solid_at_iou_points),
-        "iou_raw": metrics.iou(prediction.solid, prepared.raw_solid_at_iou_points),
+        "iou": metrics.iou(prediction.solid, prepared.solid_at_iou_points, weights),
+        "iou_raw": metrics.iou(prediction.solid, prepared.raw_solid_at_iou_points, weights),
         "chamfer_l2": metrics.chamfer_l2(match),
         "chamfer_l1": metrics.chamfer_l1(match),
         "normal_consistency": metrics.normal_consistency(prediction.normals, prepared.surface_normals, match),
         "f_score_1": metrics.f_score(match, F_SCORE_DISTANCES[0]),
         "f_score_2": metrics.f_score(match, F_SCORE_DISTANCES[1]),
+        **calibration,
     }, None
 
 
@@ -369,11 +399,11 @@ def implausible_touches(touched: NDArray[np.bool_], prepared: PreparedObject) ->
 
 def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:
     """Estimates over objects and seeds of results in the order object by object, seed by seed."""
-    groups: dict[str, dict[str, NDArray]] = {}
     rows = {
-        **{str(count): [result.protocols[str(count)] for result in results] for count in PROTOCOL_POSES},
-        "exploration": [result.exploration for result in results],
+        "areas": [result.areas for result in results],
+        **{str(count): [result.poses[str(count)] for result in results] for count in RECONSTRUCTED_POSES},
     }
+    groups: dict[str, dict[str, NDArray]] = {}
     for group, values in rows.items():
         groups[group] = {
             name: np.array([row[name] for row in values], dtype=np.float64).reshape(objects, -1)
@@ -394,9 +424,9 @@ def _notes(
         where = f"{result.object}, seed {result.seed}"
         if result.missing:
             notes.append(f"{where}: missing, counted as empty: {', '.join(result.missing)}")
-        for protocol, reason in result.reasons.items():
+        for count, reason in result.reasons.items():
             if reason is not None and reason != "missing":
-                empty.setdefault(reason, []).append(f"{where}, {protocol} poses")
+                empty.setdefault(reason, []).append(f"{where}, {count} poses")
         if result.implausible_touches > 0:
             share = f"{100 * result.implausible_touches:.1f} %"
             notes.append(f"{where}: {share} of the touched voxels are too far from the object to hold a contact")

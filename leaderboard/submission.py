@@ -4,10 +4,9 @@ Layout (``docs/submission.md``)::
 
     submission.json
     rollouts/<object>/pose<k>_seed<s>.npz
-    reconstructions/<object>_<protocol>_seed<s>.npz or .ply
+    reconstructions/<object>_<n>_seed<s>.npz or .ply
 
-``protocol`` is 4 or 8. Reconstructions after the first 1 and 2 poses of the exploration order may be added; they only
-extend the exploration curve.
+``n`` is 1, 2, 4 or 8: the reconstruction after so many poses of the exploration order. All four are required.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ MAX_MESH_ELEMENTS: Final = 1_000_000
 EXPLORATION_ORDER: Final = PROTOCOL_POSES[4] + tuple(k for k in PROTOCOL_POSES[8] if k not in PROTOCOL_POSES[4])
 """Poses in the order of the exploration curve: its first four are the 4-pose protocol."""
 RECONSTRUCTED_POSES: Final[dict[int, tuple[int, ...]]] = {n: EXPLORATION_ORDER[:n] for n in (1, 2, 4, 8)}
-"""Poses merged in a reconstruction of each protocol; 4 and 8 are scored, 1 and 2 are optional."""
+"""Poses merged in each reconstruction, by their number; all four are required."""
 
 _ROLLOUT_ARRAYS: Final = {
     "actions": Expected("float32", (HORIZON, NUM_JOINTS)),
@@ -127,10 +126,10 @@ class Submission:
         name = rollout_name(object_name, pose, seed)
         return self._read_rollout(name) if name in self._source.sizes else None
 
-    def reconstruction(self, object_name: str, protocol: int, seed: int) -> Reconstruction | None:
+    def reconstruction(self, object_name: str, count: int, seed: int) -> Reconstruction | None:
         """One reconstruction in the object frame, or None if the submission does not hold it."""
         for suffix in ("npz", "ply"):
-            name = reconstruction_name(object_name, protocol, seed, suffix)
+            name = reconstruction_name(object_name, count, seed, suffix)
             if name in self._source.sizes:
                 return self._read_reconstruction(name)
         return None
@@ -258,9 +257,9 @@ class SubmissionWriter:
         """Whether the rollout was written, now or by an earlier writer."""
         return (self.directory / rollout_name(object_name, pose, seed)).is_file()
 
-    def has_reconstruction(self, object_name: str, protocol: int, seed: int) -> bool:
+    def has_reconstruction(self, object_name: str, count: int, seed: int) -> bool:
         """Whether the reconstruction was written, now or by an earlier writer."""
-        names = (reconstruction_name(object_name, protocol, seed, suffix) for suffix in ("npz", "ply"))
+        names = (reconstruction_name(object_name, count, seed, suffix) for suffix in ("npz", "ply"))
         return any((self.directory / name).is_file() for name in names)
 
     def add_rollout(
@@ -287,14 +286,14 @@ class SubmissionWriter:
             touched_step=rollout.touched_step,
         )
 
-    def add_reconstruction(self, object_name: str, protocol: int, seed: int, reconstruction: Reconstruction) -> None:
+    def add_reconstruction(self, object_name: str, count: int, seed: int, reconstruction: Reconstruction) -> None:
         """Writes one reconstruction in the object frame: a volume as float16, or a watertight mesh in metres.
 
         Args:
-            protocol: number of merged poses, 4 or 8; 1 and 2 extend the exploration curve.
+            count: number of merged poses: 1, 2, 4 or 8.
         """
         suffix = "npz" if isinstance(reconstruction, Volume) else "ply"
-        name = self._checked(reconstruction_name(object_name, protocol, seed, suffix), _RECONSTRUCTION_NAME, seed)
+        name = self._checked(reconstruction_name(object_name, count, seed, suffix), _RECONSTRUCTION_NAME, seed)
         if isinstance(reconstruction, Volume):
             if reconstruction.resolution > MAX_RESOLUTION:
                 raise InvalidInputError(f"{name}: resolution {reconstruction.resolution}; at most {MAX_RESOLUTION}")
@@ -326,7 +325,9 @@ class SubmissionWriter:
 
     def _checked(self, name: str, pattern: re.Pattern[str], seed: int) -> str:
         if not pattern.fullmatch(name):
-            raise InvalidInputError(f"{name}: not a file of a submission; check object, pose or protocol, and seed")
+            raise InvalidInputError(
+                f"{name}: not a file of a submission; check object, pose or number of poses, and seed"
+            )
         if seed not in self.info.seeds:
             raise InvalidInputError(f"{name}: seed {seed} is not among the submission's seeds {list(self.info.seeds)}")
         return name
@@ -341,9 +342,9 @@ def rollout_name(object_name: str, pose: int, seed: int) -> str:
     return f"rollouts/{object_name}/pose{pose}_seed{seed}.npz"
 
 
-def reconstruction_name(object_name: str, protocol: int, seed: int, suffix: str) -> str:
+def reconstruction_name(object_name: str, count: int, seed: int, suffix: str) -> str:
     """Name of a reconstruction inside a submission; ``suffix`` is ``npz`` or ``ply``."""
-    return f"reconstructions/{object_name}_{protocol}_seed{seed}.{suffix}"
+    return f"reconstructions/{object_name}_{count}_seed{seed}.{suffix}"
 
 
 def _content_hash(source: FileSource) -> str:

@@ -10,12 +10,12 @@ import trimesh
 from objects import surface_grid
 from scipy.spatial.distance import cdist
 
-from tslam_bench.constants import IOU_POINTS, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
+from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
 from tslam_bench.grids import points_to_grid, voxel_centres
 from tslam_bench.leaderboard import metrics
 from tslam_bench.leaderboard.prediction import MESH_BOUND, prepare
 from tslam_bench.reconstruction.volume import Volume
-from tslam_bench.sampling import iou_points
+from tslam_bench.sampling import iou_cells, iou_points
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -52,42 +52,84 @@ def test_iou_refuses_different_shapes() -> None:
         metrics.iou(np.ones(3, dtype=bool), np.ones(4, dtype=bool))
 
 
-def test_iou_of_translated_spheres_at_the_iou_points() -> None:
-    """Lens of two spheres: V = pi (4 r + d)(2 r - d)^2 / 12."""
-    radius, shift = 0.06, 0.03
-    centre = np.array([shift / 2, 0, 0])
-    points = iou_points()
-    a = np.linalg.norm(points - centre, axis=1) <= radius
-    b = np.linalg.norm(points + centre, axis=1) <= radius
-    lens = math.pi * (4 * radius + shift) * (2 * radius - shift) ** 2 / 12
-    expected = lens / (2 * 4 / 3 * math.pi * radius**3 - lens)
-    share = (2 * 4 / 3 * math.pi * radius**3 - lens) / WORKSPACE_EDGE**3
-    deviation = math.sqrt(expected * (1 - expected) / (share * IOU_POINTS))
-    assert abs(metrics.iou(a, b) - expected) < 4 * deviation
+def test_iou_weighs_points_by_their_volume() -> None:
+    a = np.array([1, 1, 0, 0], dtype=bool)
+    b = np.array([0, 1, 1, 0], dtype=bool)
+    assert metrics.iou(a, b, np.array([1.0, 3.0, 2.0, 50.0])) == 3 / 6
+    assert metrics.iou(a, b, np.full(4, 7.0)) == metrics.iou(a, b)
+    with pytest.raises(ValueError, match="weights for"):
+        metrics.iou(a, b, np.ones(3))
 
 
-def test_monte_carlo_deviation_of_iou() -> None:
-    """Binomial: sd = sqrt(IoU (1 - IoU) / points in the union)."""
-    radius, shift, count = 0.08, 0.02, 20_000
+def two_spheres(radius: float, shift: float, seed: int) -> tuple[float, float]:
+    """IoU of two spheres of ``radius`` (m), ``shift`` apart, at one set of points, and its closed form.
+
+    Lens of two spheres: V = pi (4 r + d)(2 r - d)^2 / 12.
+    """
     centre = np.array([shift / 2, 0, 0])
+    low, high = -radius - centre, radius - centre
+    sample = iou_points(low, high, iou_cells(low, high, 4 / 3 * math.pi * radius**3), seed)
+    a = np.linalg.norm(sample.points - centre, axis=1) <= radius
+    b = np.linalg.norm(sample.points + centre, axis=1) <= radius
     lens = math.pi * (4 * radius + shift) * (2 * radius - shift) ** 2 / 12
-    union = 2 * 4 / 3 * math.pi * radius**3 - lens
-    expected = lens / union
-    values = []
-    for seed in range(200):
-        points = WORKSPACE_EDGE * (rng(seed).random((count, 3)) - 0.5)
-        a = np.linalg.norm(points - centre, axis=1) <= radius
-        b = np.linalg.norm(points + centre, axis=1) <= radius
-        values.append(metrics.iou(a, b))
-    deviation = math.sqrt(expected * (1 - expected) / (count * union / WORKSPACE_EDGE**3))
-    assert np.mean(values) == pytest.approx(expected, abs=4 * deviation / math.sqrt(200))
-    assert np.std(values) == pytest.approx(deviation, rel=0.2)
+    return metrics.iou(a, b, sample.weights), lens / (2 * 4 / 3 * math.pi * radius**3 - lens)
+
+
+@pytest.mark.parametrize(("radius", "shift"), [(0.06, 0.03), (0.03, 0.004), (0.012, 0.02)])
+def test_iou_at_the_points_of_an_object_is_unbiased_and_sharp(radius: float, shift: float) -> None:
+    """The true solid is the sphere whose box the points follow; the other one reaches out of it."""
+    values = [two_spheres(radius, shift, seed)[0] for seed in range(30)]
+    assert np.std(values) < 0.005
+    assert np.mean(values) == pytest.approx(two_spheres(radius, shift, 0)[1], abs=4 * np.std(values) / math.sqrt(30))
 
 
 def test_surface_iou_is_not_solid_iou(sphere) -> None:
     touched = surface_grid(sphere)
     assert metrics.surface_iou(touched, sphere.surface) > 0.9
     assert metrics.iou(touched, sphere.solid) < 0.5
+
+
+# --- Calibration -----------------------------------------------------------------------------------------------
+
+
+def test_calibration_error_of_equal_bins_by_hand() -> None:
+    """Three points of equal volume in three bins: the mean of |p - y|."""
+    p, true, weights = np.array([0.1, 0.9, 0.4]), np.array([False, True, True]), np.ones(3)
+    assert metrics.calibration_error(p, true, weights, bins=3) == pytest.approx((0.1 + 0.1 + 0.6) / 3)
+    assert metrics.calibration_error(p, true, weights, bins=1) == pytest.approx(abs(p.mean() - 2 / 3))
+    assert metrics.brier_score(p, true, weights) == pytest.approx((0.01 + 0.01 + 0.36) / 3)
+
+
+def test_calibration_weighs_points_by_their_volume() -> None:
+    """A point of volume 3 is three points of volume 1."""
+    p, true = rng(0).random(40), rng(1).random(40) < 0.5
+    counts = rng(2).integers(1, 5, 40)
+    repeated = np.repeat(p, counts), np.repeat(true, counts), np.ones(counts.sum())
+    weights = counts.astype(float)
+    assert metrics.calibration_error(p, true, weights) == pytest.approx(metrics.calibration_error(*repeated), abs=1e-6)
+    assert metrics.brier_score(p, true, weights) == pytest.approx(metrics.brier_score(*repeated))
+
+
+def test_calibration_does_not_depend_on_the_order_of_points() -> None:
+    """Also where a cut divides points of one probability."""
+    p, true, weights = rng(0).integers(0, 4, 5000) / 4, rng(1).random(5000) < 0.3, rng(2).random(5000)
+    order = np.lexsort((true, p))
+    expected = metrics.calibration_error(p, true, weights)
+    for chosen in (order, order[::-1], rng(3).permutation(5000)):
+        assert metrics.calibration_error(p[chosen], true[chosen], weights[chosen]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_calibration_of_a_calibrated_and_of_an_overconfident_probability() -> None:
+    p = rng(0).random(200_000)
+    true = rng(1).random(200_000) < p
+    weights = np.ones(200_000)
+    assert metrics.calibration_error(p, true, weights) < 0.005
+    assert metrics.brier_score(p, true, weights) == pytest.approx(1 / 6, abs=0.002)  # mean of p (1 - p)
+    # Rounded to 0 and 1: in each half the probability is 1/4 off on average; a bin of both halves evens out.
+    assert metrics.calibration_error(np.round(p), true, weights, bins=16) == pytest.approx(0.25, abs=0.005)
+    assert metrics.calibration_error(np.round(p), true, weights, bins=15) == pytest.approx(0.25 * 14 / 15, abs=0.005)
+    constant = np.full(200_000, 0.5)
+    assert metrics.calibration_error(constant, true, weights) < 0.005
 
 
 # --- Chamfer ---------------------------------------------------------------------------------------------------
@@ -133,8 +175,8 @@ def test_chamfer_of_parallel_plates() -> None:
     """Two parallel unit squares at distance h: h both ways."""
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    a, _ = metrics.sample_surface(square, faces, 40_000, rng(1))
-    b, _ = metrics.sample_surface(square + np.array([0, 0, 0.1]), faces, 40_000, rng(2))
+    a, _ = metrics.sample_surface(square[faces], 40_000, rng(1))
+    b, _ = metrics.sample_surface(square[faces] + [0, 0, 0.1], 40_000, rng(2))
     match = metrics.match_surfaces(a, b)
     assert metrics.chamfer_l2(match) == pytest.approx(0.01, rel=0.01)
     assert metrics.chamfer_l1(match) == pytest.approx(0.1, rel=0.01)
@@ -167,7 +209,7 @@ def test_normal_consistency_of_voxel_faces_on_a_sphere() -> None:
     E[sum n_i^2] / E[sum |n_i|] = 2/3. No choice of axis-aligned faces can exceed E[max |n_i|] = 0.83."""
     centres = np.linalg.norm(voxel_centres(128), axis=-1)
     mesh = Volume((centres < 0.1).astype(np.float32), "nearest").to_mesh()
-    points, normals = metrics.sample_surface(mesh.vertices, mesh.faces, 60_000, rng(1))
+    points, normals = metrics.sample_surface(mesh.triangles, 60_000, rng(1))
     true, true_normals = sphere_samples(0.1, 60_000, rng(2))
     match = metrics.match_surfaces(points, true)
     value = metrics.normal_consistency(normals, true_normals, match)
@@ -203,7 +245,7 @@ def test_f_score_zero_over_zero_is_zero() -> None:
 
 
 def test_samples_are_area_uniform_and_on_the_surface(box) -> None:
-    points, normals = metrics.sample_surface(box.vertices, box.faces, 60_000, rng(1))
+    points, normals = metrics.sample_surface(box.vertices[box.faces], 60_000, rng(1))
     half = np.ptp(box.vertices, axis=0) / 2
     axis = np.abs(normals).argmax(axis=1)
     np.testing.assert_allclose(
@@ -218,8 +260,8 @@ def test_samples_are_area_uniform_and_on_the_surface(box) -> None:
 def test_samples_are_reproducible_and_skip_degenerate_faces() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]], dtype=float)
     faces = np.array([[0, 1, 3], [0, 1, 2], [0, 3, 1]])  # the first and last have no area
-    a = metrics.sample_surface(vertices, faces, 1000, rng(5))
-    b = metrics.sample_surface(vertices, faces, 1000, rng(5))
+    a = metrics.sample_surface(vertices[faces], 1000, rng(5))
+    b = metrics.sample_surface(vertices[faces], 1000, rng(5))
     np.testing.assert_array_equal(a[0], b[0])
     assert np.isfinite(a[1]).all()
     np.testing.assert_allclose(a[1], [[0, 0, 1]] * 1000)
@@ -227,9 +269,9 @@ def test_samples_are_reproducible_and_skip_degenerate_faces() -> None:
 
 def test_sampling_refuses_a_mesh_without_area() -> None:
     with pytest.raises(ValueError, match="no area"):
-        metrics.sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, rng())
+        metrics.sample_surface(np.zeros((1, 3, 3)), 10, rng())
     with pytest.raises(ValueError, match="no area"):
-        metrics.sample_surface(np.zeros((0, 3)), np.zeros((0, 3)), 10, rng())
+        metrics.sample_surface(np.zeros((0, 3, 3)), 10, rng())
 
 
 # --- Exploration -----------------------------------------------------------------------------------------------
@@ -287,19 +329,21 @@ def test_mesh_and_volume_of_one_box_agree_with_the_true_box(box) -> None:
     mesh.apply_translation([shift, 0, 0])
     length = float(np.ptp(box.vertices[:, 0]))
     expected = (length - shift) / (length + shift)
-    prediction = prepare(mesh, iou_points())
-    assert metrics.iou(prediction.solid, box.solid_at_iou_points) == pytest.approx(expected, abs=0.02)
+    sample = box.iou_points()
+    prediction = prepare(mesh, sample.points)
+    found = metrics.iou(prediction.solid, box.solid_at_iou_points, sample.weights)
+    assert found == pytest.approx(expected, abs=0.01)
 
     half = np.ptp(box.vertices, axis=0) / 2
     outside = (np.abs(voxel_centres(128) - [shift, 0, 0]) - half).max(axis=-1)
     volume = Volume(np.clip(0.5 - outside / (2 * WORKSPACE_EDGE / 128), 0, 1))
-    from_volume = prepare(volume, iou_points())
-    assert metrics.iou(from_volume.solid, prediction.solid) > 0.98
+    from_volume = prepare(volume, sample.points)
+    assert metrics.iou(from_volume.solid, prediction.solid, sample.weights) > 0.98
     assert np.mean(from_volume.points, axis=0) == pytest.approx([shift, 0, 0], abs=1e-3)
 
 
 def test_perfect_prediction_reaches_the_ceilings(sphere) -> None:
-    prediction = prepare(trimesh.Trimesh(sphere.vertices, sphere.faces), iou_points())
+    prediction = prepare(trimesh.Trimesh(sphere.vertices, sphere.faces), sphere.iou_points().points)
     match = metrics.match_surfaces(metrics.to_metric(prediction.points), metrics.to_metric(sphere.surface_points))
     area = 4 * math.pi * (0.05 / WORKSPACE_EDGE) ** 2
     assert metrics.iou(prediction.solid, sphere.solid_at_iou_points) == 1
@@ -320,7 +364,7 @@ def test_perfect_prediction_reaches_the_ceilings(sphere) -> None:
     ],
 )
 def test_invalid_predictions_count_as_empty(mesh, reason: str) -> None:
-    prediction = prepare(mesh, iou_points()[:100])
+    prediction = prepare(mesh, rng().uniform(-0.1, 0.1, (100, 3)))
     assert reason in (prediction.reason or "")
     assert not prediction.solid.any()
     assert prediction.points.shape == prediction.normals.shape == (0, 3)
@@ -329,8 +373,8 @@ def test_invalid_predictions_count_as_empty(mesh, reason: str) -> None:
 def test_inverted_mesh_counts_as_empty() -> None:
     mesh = trimesh.creation.box(extents=[0.1, 0.1, 0.1])
     mesh.invert()
-    assert "inwards" in (prepare(mesh, iou_points()[:100]).reason or "")
+    assert "inwards" in (prepare(mesh, rng().uniform(-0.1, 0.1, (100, 3))).reason or "")
 
 
-def test_mesh_bound_leaves_room_for_marching_cubes() -> None:
+def test_mesh_bound_leaves_room_for_the_surface_of_a_full_volume() -> None:
     assert np.abs(Volume(np.ones((8, 8, 8))).to_mesh().vertices).max() < MESH_BOUND

@@ -19,7 +19,7 @@ from tslam_bench.assets import store
 from tslam_bench.assets.store import PreparedObject
 from tslam_bench.cli import main
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.leaderboard.aggregate import Estimate
+from tslam_bench.leaderboard.aggregate import Estimate, interval, resampled_means
 from tslam_bench.leaderboard.charts import Axis, Line, line_chart
 from tslam_bench.leaderboard.commands import find_inputs, page_main, score_main
 from tslam_bench.leaderboard.info import SubmissionInfo, Training
@@ -111,33 +111,43 @@ def run(box: PreparedObject, torus: PreparedObject, cache: Path, tmp_path_factor
 # --- Ranking ---------------------------------------------------------------------------------------------------
 
 
-def fake_score(explorer: str, iou: list[float], chamfer: float, area: float, **changes) -> SubmissionScore:
-    """A score with chosen figures: ranking reads nothing else."""
-    objects = tuple(f"object{k}" for k in range(len(iou)))
-    values = {"iou": 0.0, "chamfer_l2": chamfer, "touched_surface_recall": 0.5}
+def fake_score(
+    explorer: str, iou: list[float] | np.ndarray, chamfer: float = 0.1, area: float = 0.3, iou_8=None, **changes
+) -> SubmissionScore:
+    """A score with chosen figures: ranking reads nothing else.
+
+    Args:
+        iou: IoU area of each object, or (objects, seeds).
+        iou_8: mean IoU at 8 poses; by default that of ``iou``.
+    """
+    matrix = np.array(iou, dtype=float).reshape(len(iou), -1)
+    objects = tuple(f"object{k}" for k in range(len(matrix)))
+    seeds = tuple(range(matrix.shape[1]))
+    values: dict[str, float | None] = {"chamfer_l2": chamfer, "touched_surface_recall": 0.5, "surface_iou": 0.5}
     results = tuple(
         ObjectScore(
             object=name,
-            seed=0,
-            protocols={"4": values | {"iou": value}, "8": values | {"iou": value}},
-            reasons={"4": None, "8": None},
-            poses={n: {"iou": value, "touched_surface_recall": 0.5, "surface_iou": 0.5} for n in ("1", "2", "4", "8")},
+            seed=seed,
+            poses={n: {**values, "iou": float(matrix[k, seed])} for n in ("1", "2", "4", "8")},
+            reasons=dict.fromkeys(("1", "2", "4", "8")),
+            areas={"iou_area": float(matrix[k, seed]), "exploration_area": area},
             recall_curve=[0.0, area],
             surface_iou_curve=[0.0, area],
-            exploration={"exploration_area": area},
             implausible_touches=0.0,
             missing=[],
         )
-        for name, value in zip(objects, iou, strict=True)
+        for k, name in enumerate(objects)
+        for seed in seeds
     )
 
     def same(value: float) -> Estimate:
         return Estimate(value, value, value, value, value, value)
 
-    at = {"iou": same(float(np.mean(iou))), "chamfer_l2": same(chamfer)}
-    aggregate = {"4": at, "8": at, "exploration": {"exploration_area": same(area)}}
+    mean = float(matrix.mean())
+    at = {"iou": same(mean if iou_8 is None else iou_8), "chamfer_l2": same(chamfer)}
+    aggregate = {"areas": {"iou_area": same(mean), "exploration_area": same(area)}, **dict.fromkeys("1248", at)}
     reconstructor = changes.pop("reconstructor", "hull")
-    about = info(explorer, reconstructor, **changes)
+    about = info(explorer, reconstructor, **({"seeds": seeds} | changes))
     return SubmissionScore(about, f"{explorer}-{reconstructor}", objects, "0" * 64, results, aggregate, ())
 
 
@@ -145,17 +155,64 @@ def order(scores: list[SubmissionScore]) -> list[tuple[int | None, str]]:
     return [(e["rank"], e["submission"]["explorer"]) for e in rank(scores)["tables"][0]["entries"]]
 
 
-def test_rank_by_iou_then_chamfer_then_area() -> None:
+def test_order_is_by_area_then_iou_at_8_then_chamfer() -> None:
     scores = [
-        fake_score("worst", [0.1, 0.1], 0.1, 0.9),
-        fake_score("best", [0.6, 0.4], 0.9, 0.1),
-        fake_score("tie_far", [0.3, 0.3], 0.2, 0.9),
-        fake_score("tie_near_less", [0.2, 0.4], 0.1, 0.4),
-        fake_score("tie_near_more", [0.4, 0.2], 0.1, 0.5),
+        fake_score("worst", [0.1, 0.1]),
+        fake_score("best", [0.6, 0.4], chamfer=0.9),
+        fake_score("tie_far", [0.3, 0.3], chamfer=0.2, iou_8=0.4),
+        fake_score("tie_near", [0.2, 0.4], chamfer=0.1, iou_8=0.4),
+        fake_score("tie_high", [0.4, 0.2], chamfer=0.5, iou_8=0.5),
     ]
-    expected = ["best", "tie_near_more", "tie_near_less", "tie_far", "worst"]
-    assert order(scores) == [(k + 1, name) for k, name in enumerate(expected)]
+    expected = ["best", "tie_high", "tie_near", "tie_far", "worst"]
+    assert [name for _, name in order(scores)] == expected
     assert order(scores[::-1]) == order(scores)
+
+
+def test_entries_whose_paired_difference_may_be_0_share_a_rank() -> None:
+    """Objects differ far more than entries: only the paired difference tells them apart."""
+    base = np.random.default_rng(0).uniform(0.2, 0.8, (20, 3))
+    wobble = np.random.default_rng(1).normal(0, 0.02, (4, 20, 3))
+    wobble -= wobble.mean(axis=(1, 2), keepdims=True)
+    scores = [
+        fake_score("first", base),
+        fake_score("near", base + wobble[0] - 0.002),
+        fake_score("steady", base - 0.003),  # nearer to the first than "far" but surely behind it
+        fake_score("with_steady", base + wobble[1] - 0.004),
+        fake_score("last", base + wobble[2] - 0.05),
+        fake_score("also_last", base + wobble[3] - 0.051),
+    ]
+    ranks = [(1, "first"), (1, "near"), (3, "steady"), (3, "with_steady"), (5, "last"), (5, "also_last")]
+    assert order(scores) == order(scores[::-1]) == ranks
+    entries = rank(scores)["tables"][0]["entries"]
+    assert entries[0]["behind_leader"] is None
+    near, steady, with_steady = (entry["behind_leader"] for entry in entries[1:4])
+    assert near["low"] < 0 < near["high"] and near["mean"] == pytest.approx(0.002)
+    assert steady["low"] == pytest.approx(steady["high"]) == pytest.approx(0.003)
+    assert with_steady["mean"] == pytest.approx(0.001)  # behind the leader of its own group
+    # Without the pairing nothing could be told apart.
+    low, high = interval(resampled_means(base))
+    assert high - low > 0.1
+
+
+def test_a_privileged_entry_neither_leads_nor_counts() -> None:
+    base = np.random.default_rng(0).uniform(0.2, 0.8, (20, 1))
+    wobble = np.random.default_rng(1).normal(0, 0.02, (20, 1))
+    scores = [
+        fake_score("oracle", base + 0.1, privileged=True),
+        fake_score("a", base),
+        fake_score("tslam_chamfer", base - 0.0005, privileged=True),
+        fake_score("b", base + wobble - wobble.mean() - 0.001),
+        fake_score("c", base - 0.1),
+    ]
+    assert order(scores) == [(None, "oracle"), (1, "a"), (None, "tslam_chamfer"), (1, "b"), (3, "c")]
+
+
+def test_entries_with_other_numbers_of_seeds_are_paired_by_object() -> None:
+    base = np.random.default_rng(0).uniform(0.2, 0.8, (20, 1))
+    scores = [fake_score("a", base.repeat(3, axis=1)), fake_score("b", base - 0.01)]
+    assert order(scores) == [(1, "a"), (2, "b")]
+    difference = rank(scores)["tables"][0]["entries"][1]["behind_leader"]
+    assert difference["low"] == pytest.approx(0.01) == pytest.approx(difference["high"])
 
 
 def test_privileged_entries_hold_no_rank() -> None:
@@ -299,8 +356,8 @@ def test_page_shows_the_scores(page: Path, run: Path) -> None:
                 run / "scores" / f"{entry['submission']['explorer']}-{entry['submission']['reconstructor']}.json"
             ).read_text()
         )
-        mean = np.mean([result["protocols"]["8"]["iou"] for result in score["results"]])
-        assert entry["aggregate"]["8"]["iou"]["mean"] == pytest.approx(mean)
+        mean = np.mean([result["areas"]["iou_area"] for result in score["results"]])
+        assert entry["aggregate"]["areas"]["iou_area"]["mean"] == pytest.approx(mean)
         assert f">{mean:.3f}<" in text
     assert "12,345" in text and "a toaster" in text and "not replayed" in text and "privileged" in text
 
@@ -325,8 +382,9 @@ def test_page_without_submissions_has_no_pictures(run: Path, tmp_path: Path) -> 
 def test_page_of_fake_scores_with_missing_figures() -> None:
     scores = [fake_score("a", [0.2], 0.1, 0.3), fake_score("b", [0.2, 0.3], 0.1, 0.3)]
     oracle = fake_score("oracle", [0.9], 0.1, 0.3, privileged=True)
+    areas = {"iou_area": oracle.aggregate["areas"]["iou_area"]}
     results = tuple(replace(r, recall_curve=[], surface_iou_curve=[]) for r in oracle.results)
-    oracle = replace(oracle, results=results, aggregate=oracle.aggregate | {"exploration": {}})
+    oracle = replace(oracle, results=results, aggregate=oracle.aggregate | {"areas": areas})
     Page(build_page(rank([*scores, oracle]), {}))
 
 
@@ -342,7 +400,8 @@ def test_score_prints_a_table_and_writes_json(run: Path, tmp_path: Path, capsys:
     assert value == json.loads((run / "scores" / "mine-hull.json").read_text())
     for name in NAMES:
         assert name in printed
-    assert f"{value['aggregate']['8']['iou']['mean']:.3f}" in printed
+    for group, metric in (("areas", "iou_area"), ("1", "iou"), ("8", "iou"), ("8", "calibration_error")):
+        assert f"{value['aggregate'][group][metric]['mean']:.3f}" in printed
 
 
 def test_score_prints_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

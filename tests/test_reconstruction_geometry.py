@@ -12,6 +12,7 @@ from scipy.spatial import Delaunay
 from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.leaderboard.metrics import iou
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
@@ -74,10 +75,10 @@ def test_hull_of_a_sphere_is_a_sphere(radius):
 
 @pytest.mark.parametrize("shape", list(SHAPES))
 def test_oracle_touches_of_large_convex_shapes_reach_the_solid(shape):
-    points = iou_points()
-    true = SHAPES[shape](0.06)(*points.T) <= 0
-    predicted = HullReconstructor().reconstruct(crossed(shape, 0.06), EMPTY).query(points) >= 0.5
-    assert overlap(predicted, true) >= 0.85
+    sample = iou_points(np.full(3, -0.06), np.full(3, 0.06), (50, 50, 50))
+    true = SHAPES[shape](0.06)(*sample.points.T) <= 0
+    predicted = HullReconstructor().reconstruct(crossed(shape, 0.06), EMPTY).query(sample.points) >= 0.5
+    assert iou(predicted, true, sample.weights) >= 0.85
 
 
 @pytest.mark.parametrize(("seed", "count"), [(0, 4), (1, 6), (2, 15), (3, 200)])
@@ -145,7 +146,7 @@ def test_grid_round_trip():
     touched = random_touches(1, 300)
     volume = GridReconstructor().reconstruct(touched, EMPTY)
     assert np.array_equal(volume.query(grids.voxel_centres().reshape(-1, 3)).reshape(touched.shape) >= 0.5, touched)
-    points = iou_points()
+    points = np.random.default_rng(0).uniform(WORKSPACE_LOW, -WORKSPACE_LOW, (100_000, 3))
     assert np.array_equal(
         grids.points_to_grid(points[volume.query(points) >= 0.5]), touched & grids.points_to_grid(points)
     )

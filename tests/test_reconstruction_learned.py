@@ -15,6 +15,7 @@ import trimesh
 from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.leaderboard.metrics import iou
 from tslam_bench.reconstruction import convonet, ifnet
 from tslam_bench.reconstruction.feature_sampling import sample_features
 from tslam_bench.reconstruction.learned import (
@@ -285,9 +286,10 @@ def test_network_overfits_one_shape(architecture, torus):
         optimizer.step()
         schedule.step()
     volume = LearnedReconstructor(architecture, network.eval()).reconstruct(touches.touched, touches.visited)
-    points = iou_points()
-    true = (np.hypot(points[:, 0], points[:, 1]) - 0.06) ** 2 + points[:, 2] ** 2 < 0.025**2
-    assert overlap(volume.query(points) >= 0.5, true) > 0.9
+    sample = iou_points(np.array([-0.085, -0.085, -0.025]), np.array([0.085, 0.085, 0.025]), (60, 60, 30))
+    x, y, z = sample.points.T
+    true = (np.hypot(x, y) - 0.06) ** 2 + z**2 < 0.025**2
+    assert iou(volume.query(sample.points) >= 0.5, true, sample.weights) > 0.9
 
 
 def test_training_is_reproducible_and_resumes_exactly(smallest_ifnet, tmp_path, torus, wedge):

@@ -88,6 +88,7 @@ def submission(folder: Path, box, info: SubmissionInfo = INFO, skip: tuple[str, 
 def test_the_truth_scores_full_marks(truth: Truth, box) -> None:
     values, reason = score_reconstruction(trimesh.Trimesh(box.vertices, box.faces), truth)
     assert reason is None
+    assert values["calibration_error"] is values["brier"] is None  # a mesh claims no probability
     assert values["iou"] == values["iou_raw"] == values["f_score_1"] == values["f_score_2"] == 1
     area = trimesh.Trimesh(box.vertices, box.faces).area / WORKSPACE_EDGE**2
     assert values["chamfer_l2"] == pytest.approx(area / (np.pi * 100_000), rel=0.05)
@@ -101,17 +102,44 @@ def test_a_translated_box(truth: Truth, box) -> None:
     mesh = trimesh.Trimesh(box.vertices + np.array([shift, 0, 0]), box.faces)
     values, _ = score_reconstruction(mesh, truth)
     length, width, height = np.ptp(box.vertices, axis=0)
-    assert values["iou"] == pytest.approx((length - shift) / (length + shift), abs=0.01)
+    assert values["iou"] == pytest.approx((length - shift) / (length + shift), abs=0.01)  # two deviations
     share_across = 2 * width * height / mesh.area
     assert share_across * shift / WORKSPACE_EDGE < values["chamfer_l1"] < shift / WORKSPACE_EDGE
 
 
-def test_an_empty_reconstruction_scores_the_worst(truth: Truth) -> None:
-    for nothing in (None, Volume(np.zeros((4, 4, 4))), trimesh.creation.box(extents=[2, 2, 2])):
-        values, reason = score_reconstruction(nothing, truth)
-        assert values == SHAPE_METRICS
-        assert reason
+def test_an_empty_reconstruction_scores_the_worst(truth: Truth, box) -> None:
+    share = np.ptp(box.vertices, axis=0).prod() / WORKSPACE_EDGE**3
+    calibrations = {
+        "missing": (1, 1),
+        "nothing is solid": (pytest.approx(share, rel=0.02), pytest.approx(share, rel=0.02)),
+        "outside the workspace": (None, None),
+    }
+    for nothing, reason in zip(
+        (None, Volume(np.zeros((4, 4, 4))), trimesh.creation.box(extents=[2, 2, 2])), calibrations, strict=True
+    ):
+        values, found = score_reconstruction(nothing, truth)
+        assert {name: values[name] for name in SHAPE_METRICS} == SHAPE_METRICS
+        assert (values["calibration_error"], values["brier"]) == calibrations[reason]
+        assert reason in (found or "")
     assert SHAPE_METRICS["chamfer_l2"] == pytest.approx(3) and SHAPE_METRICS["chamfer_l1"] == pytest.approx(3**0.5)
+
+
+def test_calibration_of_a_volume(truth: Truth, box) -> None:
+    """The true voxels at probability 0.8, the rest at 0.1: Brier score and calibration error by hand."""
+    solid = Volume(box.solid.astype(np.float32), "nearest")
+    values, _ = score_reconstruction(Volume(np.where(box.solid, 0.8, 0.1), "nearest"), truth)
+    weights, true = truth.iou_points.weights, box.solid_at_iou_points
+    claimed = solid.query(truth.iou_points.points) == 1
+    share = [weights[claimed == side] @ true[claimed == side] / weights[claimed == side].sum() for side in (0, 1)]
+    volume = weights[claimed].sum() / weights.sum()
+    assert 0.01 < volume < 1 / 15  # so the claimed points are in the last bin, together with some of the others
+    last = 1 / 15
+    expected = (1 - last) * abs(0.1 - share[0]) + abs(volume * (0.8 - share[1]) + (last - volume) * (0.1 - share[0]))
+    assert values["calibration_error"] == pytest.approx(expected, rel=1e-4)
+    brier = volume * (share[1] * 0.04 + (1 - share[1]) * 0.64) + (1 - volume) * (
+        share[0] * 0.81 + (1 - share[0]) * 0.01
+    )
+    assert values["brier"] == pytest.approx(brier, rel=1e-4)
 
 
 def test_worse_shapes_score_worse(truth: Truth, box) -> None:
@@ -133,8 +161,8 @@ def test_complete_submission(tmp_path: Path, truth: Truth, box) -> None:
     assert [r.seed for r in results] == [0, 1]
     for result in results:
         assert result.missing == [] and result.implausible_touches == 0
-        assert result.reasons == {"4": None, "8": None}
-        assert result.protocols["8"]["iou"] == 1
+        assert set(result.reasons.values()) == {None}
+        assert result.areas["iou_area"] == 1
         assert [result.poses[n]["iou"] for n in ("1", "2", "4", "8")] == [1, 1, 1, 1]
         recalls = [result.poses[n]["touched_surface_recall"] for n in ("1", "2", "4", "8")]
         assert np.all(np.diff(np.array(recalls, dtype=float)) > 0)
@@ -143,7 +171,7 @@ def test_complete_submission(tmp_path: Path, truth: Truth, box) -> None:
         assert np.array(result.recall_curve)[[20, 40, 80, 160]] == pytest.approx(recalls, abs=1e-5)
         surface = [result.poses[n]["surface_iou"] for n in ("1", "2", "4", "8")]
         assert np.array(result.surface_iou_curve)[[20, 40, 80, 160]] == pytest.approx(surface, abs=1e-5)
-        assert result.exploration["exploration_area"] == pytest.approx(np.mean(result.recall_curve), abs=0.01)
+        assert result.areas["exploration_area"] == pytest.approx(np.mean(result.recall_curve), abs=0.01)
 
 
 def test_poses_are_turned_back_before_they_are_merged(tmp_path: Path, truth: Truth, box) -> None:
@@ -154,8 +182,8 @@ def test_poses_are_turned_back_before_they_are_merged(tmp_path: Path, truth: Tru
     for pose in EXPLORATION_ORDER[:4]:
         world = explored(surface_grid(box), pose, 0.1, 0)["touched"]
         touched |= grids.points_to_grid(centres[world] @ grids.pose_rotation(pose))  # rows: R^T p
-    assert result.protocols["4"]["surface_iou"] == pytest.approx(metrics.surface_iou(touched, box.surface))
-    assert result.protocols["4"]["touched_surface_recall"] == pytest.approx(truth.coverage.recall(touched))
+    assert result.poses["4"]["surface_iou"] == pytest.approx(metrics.surface_iou(touched, box.surface))
+    assert result.poses["4"]["touched_surface_recall"] == pytest.approx(truth.coverage.recall(touched))
 
 
 def test_first_touch_counts_and_missing_poses_take_their_time(tmp_path: Path, box) -> None:
@@ -179,28 +207,32 @@ def test_first_touch_counts_and_missing_poses_take_their_time(tmp_path: Path, bo
 
 def test_missing_reconstruction_counts_as_empty(tmp_path: Path, truth: Truth, box) -> None:
     results = score_object(submission(tmp_path / "s", box, skip=("reconstructions/box_8_seed1.ply",)), truth)
-    assert results[0].protocols["8"]["iou"] == 1
-    assert results[1].protocols["8"]["iou"] == 0
-    assert results[1].protocols["8"]["chamfer_l2"] == pytest.approx(3)
-    assert results[1].reasons == {"4": None, "8": "missing"}
+    assert results[0].poses["8"]["iou"] == 1
+    assert results[1].poses["8"]["iou"] == 0
+    assert results[1].poses["8"]["chamfer_l2"] == pytest.approx(3)
+    assert results[1].reasons == {"1": None, "2": None, "4": None, "8": "missing"}
     assert results[1].missing == ["reconstruction of 8 poses"]
-    assert aggregate(results, 1)["8"]["iou"].mean == 0.5
+    assert (results[0].areas["iou_area"], results[1].areas["iou_area"]) == (1, 0.75)
+    estimates = aggregate(results, 1)
+    assert estimates["8"]["iou"].mean == 0.5 and estimates["areas"]["iou_area"].mean == 0.875
+    assert "calibration_error" not in estimates["8"]  # the others are meshes
 
 
 def test_reconstruction_without_its_rollouts_counts_as_empty(tmp_path: Path, truth: Truth, box) -> None:
     """Pose 1 is in the 8-pose protocol only."""
     result = score_object(submission(tmp_path / "s", box, skip=("rollouts/box/pose1_seed0.npz",)), truth)[0]
-    assert result.protocols["4"]["iou"] == 1
-    assert result.protocols["8"]["iou"] == 0
+    assert result.poses["4"]["iou"] == 1
+    assert result.poses["8"]["iou"] == 0
     assert result.reasons["8"] == "rollouts of poses 1 are missing"
     assert result.missing == ["rollout of pose 1"]
 
 
-def test_optional_reconstructions_are_not_missed(tmp_path: Path, truth: Truth, box) -> None:
+def test_all_four_reconstructions_are_required(tmp_path: Path, truth: Truth, box) -> None:
     skip = ("reconstructions/box_1_seed0.ply", "reconstructions/box_2_seed0.ply")
     result = score_object(submission(tmp_path / "s", box, skip=skip), truth)[0]
-    assert result.missing == []
-    assert [result.poses[n]["iou"] for n in ("1", "2", "4", "8")] == [None, None, 1, 1]
+    assert result.missing == ["reconstruction of 1 pose", "reconstruction of 2 poses"]
+    assert [result.poses[n]["iou"] for n in ("1", "2", "4", "8")] == [0, 0, 1, 1]
+    assert result.areas["iou_area"] == 0.5
 
 
 def test_reference_without_rollouts_is_scored_by_shape_only(tmp_path: Path, truth: Truth, box) -> None:
@@ -208,11 +240,11 @@ def test_reference_without_rollouts_is_scored_by_shape_only(tmp_path: Path, trut
     with SubmissionWriter(tmp_path / "s", info) as writer:
         writer.add_reconstruction("box", 8, 0, Volume(box.solid.astype(np.float32), "nearest"))
     result = score_object(read_submission(tmp_path / "s", objects=["box"]), truth)[0]
-    assert result.protocols["8"]["iou"] == pytest.approx(metrics.iou(box.solid, box.solid), abs=0.2)
-    assert result.protocols["8"]["surface_iou"] is None
-    assert result.exploration["exploration_area"] is None
+    assert result.poses["8"]["iou"] == pytest.approx(metrics.iou(box.solid, box.solid), abs=0.2)
+    assert result.poses["8"]["surface_iou"] is None
+    assert result.areas["exploration_area"] is None
     estimates = aggregate([result], 1)
-    assert "surface_iou" not in estimates["8"] and "iou" in estimates["8"] and estimates["exploration"] == {}
+    assert "surface_iou" not in estimates["8"] and "iou" in estimates["8"] and set(estimates["areas"]) == {"iou_area"}
 
 
 def test_touches_far_from_the_object_are_found(box) -> None:
@@ -240,7 +272,8 @@ def test_score_files_round_trip(tmp_path: Path, truth: Truth, box) -> None:
     text = json.dumps(score.to_json(), allow_nan=False)
     again = SubmissionScore.from_json(json.loads(text), "file")
     assert again.to_json() == score.to_json()
-    np.testing.assert_array_equal(score.matrix("iou", 8), [[1, 1]])
+    np.testing.assert_array_equal(score.matrix("8", "iou"), [[1, 1]])
+    np.testing.assert_array_equal(score.matrix("areas", "iou_area"), [[1, 1]])
     assert not again.verified
     others: list = [None, [], {}, {"score_version": 1}, json.loads(text) | {"score_version": 0}]
     for broken in others:

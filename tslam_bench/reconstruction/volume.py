@@ -1,12 +1,12 @@
 """An occupancy probability over the workspace: what every reconstructor returns (protocol section 9).
 
-numpy, scipy, scikit-image and trimesh only, so that scoring can read it without torch or a simulator.
+numpy, numba and trimesh only, so that scoring can read it without torch or a simulator.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 import trimesh
@@ -17,8 +17,6 @@ from tslam_bench.errors import InvalidInputError
 
 Interpolation = Literal["nearest", "linear"]
 
-_CROSSING_MARGIN: Final = 1e-4  # marching cubes degenerates where a sample equals the level: keep this much away
-
 
 @dataclass(frozen=True, eq=False)
 class Volume:
@@ -26,8 +24,9 @@ class Volume:
 
     Attributes:
         probability: (R, R, R) float32 in [0, 1], index ``[ix, iy, iz]``; converted to float32 if it is not.
-        interpolation: how the samples extend over W. ``"nearest"``: constant in each cell. ``"linear"``: trilinear
-            between cell centres, constant from the outermost centres to the faces of W.
+        interpolation: how the samples extend over W. ``"nearest"``: constant in each cell. ``"linear"``: linear on
+            the 24 tetrahedra of each cell between centres (:mod:`tslam_bench.reconstruction.isosurface`), constant from the
+            outermost centres to the faces of W.
 
     Raises:
         InvalidInputError: the array is not cubic, holds values that are not finite or outside [0, 1], or the
@@ -63,65 +62,51 @@ class Volume:
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InvalidInputError(f"points: shape {points.shape}, expected (M, 3) in metres")
-        size = self.resolution
         cells = (points - WORKSPACE_LOW) / self.cell_edge
-        inside = ((cells >= 0) & (cells < size)).all(axis=1)
-        result = np.zeros(len(points), dtype=np.float32)
-        cells = cells[inside]
         if self.interpolation == "nearest":
-            result[inside] = self.probability[tuple(np.floor(cells).astype(np.int64).T)]
-            return result
+            index = np.clip(np.floor(cells).astype(np.int64), 0, self.resolution - 1)
+            result = self.probability[index[:, 0], index[:, 1], index[:, 2]]
+        else:
+            from tslam_bench.reconstruction.isosurface import interpolate
 
-        position = np.clip(cells - 0.5, 0, size - 1)
-        low = np.minimum(np.floor(position).astype(np.int64), max(size - 2, 0))
-        high = np.minimum(low + 1, size - 1)
-        fraction = position - low
-        flat = self.probability.reshape(-1)
-        value = np.zeros(len(cells))
-        for corner in range(8):
-            upper = [(corner >> axis) & 1 for axis in range(3)]
-            index = [high[:, a] if upper[a] else low[:, a] for a in range(3)]
-            weight = np.prod([fraction[:, a] if upper[a] else 1 - fraction[:, a] for a in range(3)], axis=0)
-            value += weight * flat[(index[0] * size + index[1]) * size + index[2]]
-        result[inside] = value
-        return result
+            result = interpolate(self.probability, cells - 0.5)
+        inside = ((cells >= 0) & (cells < self.resolution)).all(axis=1)
+        return result if inside.all() else np.where(inside, result, np.float32(0))
+
+    def triangles(self, threshold: float = OCCUPANCY_THRESHOLD) -> NDArray[np.float64]:
+        """The triangles of :meth:`to_mesh`, by their corners: (T, 3, 3) metres, object frame."""
+        return WORKSPACE_LOW + self.cell_edge * self._surface(threshold)[0]
 
     def to_mesh(self, threshold: float = OCCUPANCY_THRESHOLD) -> trimesh.Trimesh:
-        """Boundary of the region where the probability is at least ``threshold``: metres, object frame, faces outwards.
+        """Boundary of the region where :meth:`query` is at least ``threshold``: metres, object frame, faces outwards.
 
-        Linear: marching cubes, closed where the solid meets a face of W. Nearest: the faces of the solid cells, two
-        triangles each, corners welded; watertight unless two solid cells share no more than an edge. Nothing solid: an
+        Closed where the solid meets a face of W. Linear: watertight, exact to 1e-4 of a cell. Nearest: the faces of the solid
+        cells, two triangles each, exact; watertight unless two solid cells share no more than an edge. Nothing solid: an
         empty mesh (0 vertices, 0 faces).
         """
+        triangles, keys = self._surface(threshold)
+        _, first, corners = np.unique(keys, return_index=True, return_inverse=True)
+        vertices = WORKSPACE_LOW + self.cell_edge * triangles.reshape(-1, 3)[first]
+        return trimesh.Trimesh(vertices=vertices, faces=corners.reshape(-1, 3), process=False)
+
+    def _surface(self, threshold: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Triangles in cells from the lower corner of W (T, 3, 3), and the keys of their corners (T, 3)."""
         if not 0 < threshold < 1:
             raise InvalidInputError(f"threshold {threshold}: must lie strictly between 0 and 1")
-        solid = self.probability >= threshold
-        if not solid.any():
-            return trimesh.Trimesh(vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64), process=False)
-        vertices, faces = _cell_faces(solid) if self.interpolation == "nearest" else self._marching_cubes(threshold)
-        return trimesh.Trimesh(vertices=WORKSPACE_LOW + self.cell_edge * vertices, faces=faces, process=False)
+        if self.interpolation == "nearest":
+            return _cell_faces(self.probability >= threshold)
+        from tslam_bench.reconstruction.isosurface import surface
 
-    def _marching_cubes(self, threshold: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Vertices in cells from the lower corner of W, and faces."""
-        from skimage.measure import marching_cubes
-
-        level = self.probability.astype(np.float64) - threshold
-        level = np.where(level >= 0, np.maximum(level, _CROSSING_MARGIN), np.minimum(level, -_CROSSING_MARGIN))
-        # Mirroring the sign of solid border samples puts the closing surface half a cell out: on the faces of W, where
-        # `query` stops being solid.
-        outside = np.ones(np.array(level.shape) + 2, dtype=bool)
-        outside[1:-1, 1:-1, 1:-1] = False
-        padded = np.pad(level, 1, mode="edge")
-        padded[outside] = -np.abs(padded[outside])
-        vertices, faces, _, _ = marching_cubes(padded, level=0.0, gradient_direction="ascent")
-        # Sample i of the padded array sits at cell coordinate i - 1 + 0.5.
-        return vertices.astype(np.float64) - 0.5, faces.astype(np.int64)
+        try:
+            return surface(self.probability, threshold)
+        except ValueError as error:
+            raise InvalidInputError(f"volume: {error}; smooth it or lower its resolution") from error
 
 
 def _cell_faces(solid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Faces between solid and empty cells, two outward triangles each; welded integer vertices."""
+    """Faces between solid and empty cells, two outward triangles each: corners (T, 3, 3) and their keys (T, 3)."""
     padded = np.pad(solid, 1)
-    quads = []
+    quads = [np.zeros((0, 4, 3), dtype=np.int64)]
     for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3
         for side in (0, 1):
@@ -133,9 +118,8 @@ def _cell_faces(solid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[
             corner[[2, 3], second] = 1
             quads.append(cells[:, None, :] + (corner if side else corner[::-1])[None])
     corners = np.concatenate(quads)
-    vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    index = index.reshape(-1, 4)
-    return vertices.astype(np.float64), np.concatenate([index[:, [0, 1, 2]], index[:, [0, 2, 3]]])
+    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    return triangles.astype(np.float64), np.ravel_multi_index(tuple(np.moveaxis(triangles, -1, 0)), padded.shape)
 
 
 class Reconstructor(Protocol):

@@ -78,7 +78,7 @@ Command = (
 
 def reconstructors(models: tuple[str, ...]) -> dict[str, Reconstructor]:
     """The ones that need no model, and the given models."""
-    made = {name: make_reconstructor(name) for name in ("grid", "hull", "mean_shape", "retrieval")}
+    made = {name: make_reconstructor(name) for name in ("grid", "hull", "carve", "mean_shape", "retrieval")}
     for text in models:
         name, _, path = text.partition("=")
         made[f"{name} ({Path(path).stem})"] = make_reconstructor(name, Path(path))

@@ -13,6 +13,7 @@ from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.leaderboard.metrics import iou
+from tslam_bench.reconstruction.carve import CarveReconstructor, carved_voxels
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
@@ -153,14 +154,14 @@ def test_grid_round_trip():
     assert volume.to_mesh().volume == pytest.approx(touched.sum() * VOXEL_EDGE**3, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["grid", "hull"])
+@pytest.mark.parametrize("name", ["grid", "hull", "carve"])
 def test_nothing_touched_gives_nothing(name):
     volume = make_reconstructor(name).reconstruct(EMPTY, random_touches(0, 100))
     assert not volume.probability.any()
     assert len(volume.to_mesh().faces) == 0
 
 
-@pytest.mark.parametrize("name", ["grid", "hull"])
+@pytest.mark.parametrize("name", ["grid", "hull", "carve"])
 @pytest.mark.parametrize("bad", [np.zeros((31, 32, 32), bool), np.full((32,) * 3, 0.5), np.full((32,) * 3, np.nan)])
 def test_bad_grids_are_refused(name, bad):
     with pytest.raises(InvalidInputError, match=r"^(touched|visited): "):
@@ -171,7 +172,7 @@ def test_bad_grids_are_refused(name, bad):
 
 def test_registry_names_what_it_knows():
     names = [info.id for info in list_reconstructors()]
-    assert names[:3] == ["grid", "hull", "ifnet"]
+    assert names[:4] == ["grid", "hull", "carve", "ifnet"]
     assert len(set(names)) == len(names)
     with pytest.raises(InvalidInputError, match=", ".join(names)):
         make_reconstructor("poisson")
@@ -179,6 +180,95 @@ def test_registry_names_what_it_knows():
         make_reconstructor("ifnet")
     with pytest.raises(InvalidInputError, match="takes no model"):
         make_reconstructor("hull", model="somewhere.pt")
+
+
+# --- Carve ---------------------------------------------------------------------------------------------------------
+def block(low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+    """Voxels from ``low`` up to and without ``high``."""
+    grid = EMPTY.copy()
+    grid[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
+    return grid
+
+
+def shell(grid: np.ndarray) -> np.ndarray:
+    return grid & ~binary_erosion(grid)
+
+
+def test_carve_of_a_box_with_a_visited_tunnel():
+    box = block((8, 8, 8), (20, 24, 18))
+    tunnel = block((8, 12, 10), (20, 16, 14))
+    touched = shell(box) & ~tunnel
+    kept = carved_voxels(touched, tunnel)
+    assert np.array_equal(kept, box & ~tunnel)
+    volume = CarveReconstructor().reconstruct(touched, tunnel)
+    at_centres = volume.query(grids.voxel_centres().reshape(-1, 3)).reshape(kept.shape) >= 0.5
+    assert np.array_equal(at_centres, kept)
+    # From centre to centre outside, from face to face inside; only the tunnel's edges and the box's corners are rounded.
+    expected = (11 * 15 * 9 - 11 * 4 * 4) * VOXEL_EDGE**3
+    assert volume.to_mesh().volume == pytest.approx(expected, rel=0.02)
+    assert volume.to_mesh().euler_number == 0  # a ring
+
+
+def test_carve_without_free_space_is_the_hull():
+    """Where the hull is thick; a voxel of the hull that no face connects with a touched one is left out."""
+    touched = shell(block((6, 9, 12), (20, 22, 25)))
+    hull, carve = (make_reconstructor(name).reconstruct(touched, EMPTY) for name in ("hull", "carve"))
+    points = np.random.default_rng(0).uniform(WORKSPACE_LOW, -WORKSPACE_LOW, (50_000, 3))
+    assert np.array_equal(hull.query(points) >= 0.5, carve.query(points) >= 0.5)
+
+
+def test_carve_parts_two_solids_when_the_space_between_was_visited():
+    one, other = block((4, 10, 10), (10, 16, 16)), block((20, 10, 10), (26, 16, 16))
+    between = block((10, 0, 0), (20, 32, 32))
+    kept = carved_voxels(shell(one) | shell(other), between)
+    assert np.array_equal(kept, one | other)
+    assert carved_voxels(shell(one) | shell(other), EMPTY).sum() == 22 * 6 * 6  # not visited: one bar
+    assert CarveReconstructor().reconstruct(shell(one) | shell(other), between).to_mesh().body_count == 2
+
+
+def test_carve_drops_what_no_touch_holds():
+    """A piece of the hull that free space cuts off from all touches, also where only edges connect them."""
+    touched = shell(block((4, 4, 4), (24, 24, 24)))
+    inner = block((10, 10, 10), (14, 14, 14))
+    moat = block((9, 9, 9), (15, 15, 15)) & ~inner
+    assert not (carved_voxels(touched, moat) & inner).any()
+    opened = moat & ~block((9, 9, 9), (10, 10, 10))  # a corner: it touches the inner piece at a point only
+    assert not (carved_voxels(touched, opened) & inner).any()
+    bridged = moat & ~block((9, 12, 12), (10, 13, 13))
+    assert (carved_voxels(touched, bridged) & inner).sum() == inner.sum()
+
+
+def test_carve_keeps_touched_voxels_that_were_visited():
+    touched = random_touches(3, 60)
+    kept = carved_voxels(touched, ~EMPTY)
+    assert np.array_equal(kept, touched)
+    volume = CarveReconstructor().reconstruct(touched, ~EMPTY)
+    assert (volume.query(grids.voxel_centres()[touched]) >= 0.5).all()
+
+
+def test_carve_of_one_touch_holds_its_voxel_and_no_other():
+    touched = EMPTY.copy()
+    touched[4, 15, 31] = True
+    for visited in (EMPTY, ~EMPTY):
+        assert np.array_equal(carved_voxels(touched, visited), touched)
+        mesh = CarveReconstructor().reconstruct(touched, visited).to_mesh()
+        low = WORKSPACE_LOW + VOXEL_EDGE * np.array([4, 15, 31])
+        assert mesh.is_watertight
+        assert (mesh.bounds[0] >= low - 1e-6).all() and (mesh.bounds[1] <= low + VOXEL_EDGE + 1e-6).all()
+        assert (np.abs(mesh.center_mass - low - VOXEL_EDGE / 2)[:2] < 1e-6).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_carved_voxels_agree_with_a_flood(seed):
+    """Membership in the hull by triangulation, connection by growing from the touches: other code than the carver's."""
+    touched, visited = random_touches(seed, 40), random_touches(seed + 10, 6000)
+    inside = Delaunay(grids.voxel_centres()[touched]).find_simplex(grids.voxel_centres(), tol=1e-9) >= 0
+    allowed = touched | (inside & ~visited)
+    kept, before = touched, EMPTY
+    while not np.array_equal(kept, before):
+        before, kept = kept, binary_dilation(kept) & allowed
+    assert 0 < (allowed & ~kept).sum() < allowed.sum()
+    assert np.array_equal(carved_voxels(touched, visited), kept)
 
 
 # --- Priors --------------------------------------------------------------------------------------------------------

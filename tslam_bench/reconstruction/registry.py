@@ -33,6 +33,7 @@ class ReconstructorInfo:
 _REGISTERED: Final = (
     ReconstructorInfo("grid", "nothing", "empty", "the touched voxels as they are"),
     ReconstructorInfo("hull", "nothing", "empty", "convex hull of the touched voxel centres"),
+    ReconstructorInfo("carve", "nothing", "empty", "the hull without the free space that was swept"),
     ReconstructorInfo("ifnet", "model", "empty", "IF-Net: implicit function in multi-scale features, with free space"),
     ReconstructorInfo(
         "convonet", "model", "empty", "convolutional occupancy network: a U-Net's features, with free space"
@@ -97,6 +98,10 @@ def make_reconstructor(
         from tslam_bench.reconstruction.hull import HullReconstructor
 
         return HullReconstructor()
+    if name == "carve":
+        from tslam_bench.reconstruction.carve import CarveReconstructor
+
+        return CarveReconstructor()
     if info.needs == "objects":
         from tslam_bench.reconstruction.priors import MeanShapeReconstructor, RetrievalReconstructor
         from tslam_bench.reconstruction.training_objects import load_training_objects

@@ -25,7 +25,7 @@ from tslam_bench.leaderboard.aggregate import Estimate
 from tslam_bench.leaderboard.page import build_page
 from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission
+from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
 from tslam_bench.leaderboard.submission import INFO_FILE, RECONSTRUCTED_POSES, Submission, read_submission
 
 PAGE_FILE: Final = "index.html"
@@ -41,7 +41,7 @@ class ScoreArguments:
     submissions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders or zip archives that hold submission.json."""
     output: Path | None = None
-    """JSON file for the scores; with several submissions, a folder that gets one file each."""
+    """JSON file for the scores; with several submissions, a folder that gets one file each, as soon as it is scored."""
     objects: tuple[str, ...] = ()
     """Objects to score; empty: those of the submission's object set."""
     workers: int = 1
@@ -83,11 +83,12 @@ def score_main(arguments: Sequence[str]) -> None:
     _check_workers(parsed.workers)
     files = _score_files(parsed.submissions, parsed.output)
     scores = []
-    for path, file in zip(parsed.submissions, files, strict=True):
-        with _progress(f"score {path.name}", "object") as show:
-            scores.append(score_submission(path, parsed.objects or None, parsed.workers, show))
-        if file is not None:
-            write_json(file, scores[-1].to_json())
+    with worker_pool(parsed.workers) as pool:
+        for path, file in zip(parsed.submissions, files, strict=True):
+            with _progress(f"score {path.name}", "object") as show:
+                scores.append(score_submission(path, parsed.objects or None, pool, show))
+            if file is not None:
+                write_json(file, scores[-1].to_json())
     if parsed.json:
         values = [score.to_json() for score in scores]
         print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
@@ -260,10 +261,11 @@ def _score_missing(
     """Adds scores of submissions that have none; a score of other assets or of another version does not count."""
     current = [score for score in scores if score.content_hash not in submissions or _is_current(score)]
     scored = {score.content_hash for score in current}
-    for key, (path, _) in submissions.items():
-        if key not in scored:
+    missing = [path for key, (path, _) in submissions.items() if key not in scored]
+    with worker_pool(workers if missing else 1) as pool:
+        for path in missing:
             with _progress(f"score {path.name}", "object") as show:
-                current.append(score_submission(path, None, workers, show))
+                current.append(score_submission(path, None, pool, show))
     return current
 
 

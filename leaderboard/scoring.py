@@ -195,10 +195,21 @@ class SubmissionScore:
             raise InvalidInputError(f"{where}: not a score file ({error}); score the submission again") from error
 
 
+@contextlib.contextmanager
+def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Processes for :func:`score_submission`, which keep what they loaded for the next submission; None for one worker."""
+    if workers <= 1:
+        yield None
+        return
+    # spawn: a forked copy of a process whose libraries have started threads may hang
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
 def score_submission(
     path: Path | str,
     objects: Sequence[str] | None = None,
-    workers: int = 1,
+    pool: ProcessPoolExecutor | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     cache: Path | None = None,
 ) -> SubmissionScore:
@@ -207,7 +218,7 @@ def score_submission(
     Args:
         path: folder or zip archive.
         objects: names to score; by default those of the submission's object set.
-        workers: processes that score objects; the result does not depend on it.
+        pool: processes that score objects (:func:`worker_pool`); the result does not depend on it.
         on_progress: called with (done, all) objects.
         cache: asset cache; by default the user's.
 
@@ -218,7 +229,7 @@ def score_submission(
     submission = read_submission(path)
     names = tuple(dict.fromkeys(resolve_name(name) for name in (objects or object_set(submission.info.object_set))))
     results: list[ObjectScore] = []
-    for done, scores in enumerate(_score_all(submission, Path(path), names, workers, cache), start=1):
+    for done, scores in enumerate(_score_all(submission, Path(path), names, pool, cache), start=1):
         results += scores
         if on_progress:
             on_progress(done, len(names))
@@ -239,20 +250,24 @@ def object_set(name: str) -> tuple[str, ...]:
 
 
 def _score_all(
-    submission: Submission, path: Path, names: Sequence[str], workers: int, cache: Path | None
+    submission: Submission, path: Path, names: Sequence[str], pool: ProcessPoolExecutor | None, cache: Path | None
 ) -> Iterator[list[ObjectScore]]:
-    if workers <= 1 or len(names) == 1:
+    if pool is None:
         for name in names:
             yield score_object(submission, load_truth(name, cache))
         return
-    # spawn: a forked copy of a process whose libraries have started threads may hang
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(names)), mp_context=context) as pool:
-        yield from pool.map(_score_in_process, [path] * len(names), names, [cache] * len(names))
+    count = len(names)
+    yield from pool.map(_score_in_process, [path] * count, [submission.content_hash] * count, names, [cache] * count)
 
 
-def _score_in_process(path: Path, name: str, cache: Path | None) -> list[ObjectScore]:
-    return score_object(read_submission(path, check=False), load_truth(name, cache))
+@lru_cache(maxsize=4)
+def _open_submission(path: Path, content_hash: str) -> Submission:
+    """A submission that the parent process has checked; the hash tells apart what was at ``path`` at different times."""
+    return read_submission(path, check=False)
+
+
+def _score_in_process(path: Path, content_hash: str, name: str, cache: Path | None) -> list[ObjectScore]:
+    return score_object(_open_submission(path, content_hash), load_truth(name, cache))
 
 
 def score_object(submission: Submission, truth: Truth) -> list[ObjectScore]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -25,7 +26,7 @@ from tslam_bench.leaderboard.commands import find_inputs, page_main, score_main
 from tslam_bench.leaderboard.info import SubmissionInfo, Training
 from tslam_bench.leaderboard.page import build_page, group_explorers
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission
+from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
 from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, SubmissionWriter
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
@@ -409,6 +410,15 @@ def test_score_prints_json(run: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert json.loads(capsys.readouterr().out)["objects"] == ["mug"]
 
 
+def test_each_score_is_written_as_soon_as_it_is_there(run: Path, tmp_path: Path) -> None:
+    """The second submission is refused; the first one's score is there all the same."""
+    (tmp_path / "broken").mkdir()
+    with pytest.raises(InvalidInputError, match="broken"):
+        paths = [str(run / "submissions" / "random-grid"), str(tmp_path / "broken")]
+        score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
+    assert [p.name for p in (tmp_path / "scores").iterdir()] == ["random-grid.json"]
+
+
 def test_several_scores_go_to_a_folder(run: Path, tmp_path: Path) -> None:
     paths = [str(run / "submissions" / name) for name in ("random-grid", "mine-hull")]
     score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
@@ -418,10 +428,10 @@ def test_several_scores_go_to_a_folder(run: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_processes_do_not_change_the_score(run: Path, cache: Path) -> None:
     path = run / "submissions" / "mine-hull"
-    assert (
-        score_submission(path, NAMES, workers=2, cache=cache).to_json()
-        == score_submission(path, NAMES, cache=cache).to_json()
-    )
+    with worker_pool(2) as pool:
+        assert isinstance(pool, ProcessPoolExecutor)
+        in_processes = [score_submission(path, NAMES, pool, cache=cache).to_json() for _ in range(2)]
+    assert in_processes == 2 * [score_submission(path, NAMES, cache=cache).to_json()]
 
 
 def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path: Path, monkeypatch) -> None:

@@ -50,6 +50,9 @@ INFO = SubmissionInfo(
 )
 
 
+ALL_MESHES = tuple(f"reconstructions/box_{count}_seed0.ply" for count in RECONSTRUCTED_POSES)
+
+
 @pytest.fixture(scope="module")
 def truth(box) -> Truth:
     return Truth.of(box)
@@ -279,6 +282,21 @@ def test_score_files_round_trip(tmp_path: Path, truth: Truth, box) -> None:
     for broken in others:
         with pytest.raises(InvalidInputError, match="score the submission again"):
             SubmissionScore.from_json(broken, "file")
+
+
+def test_equal_reconstructions_are_scored_once_and_alike(tmp_path: Path, truth: Truth, box) -> None:
+    """Alternating volumes against what each scores alone."""
+    other = Volume(np.roll(box.solid, 2, axis=0).astype(np.float32), "nearest")
+    volumes = {n: other if n == 2 else Volume(box.solid.astype(np.float32), "nearest") for n in RECONSTRUCTED_POSES}
+    source = submission(tmp_path / "s", box, info=replace(INFO, seeds=(0,)), skip=ALL_MESHES)
+    with SubmissionWriter(tmp_path / "s", source.info) as writer:
+        for count, volume in volumes.items():
+            writer.add_reconstruction(box.name, count, 0, volume)
+    result = score_object(read_submission(tmp_path / "s", objects=[box.name]), truth)[0]
+    for count, volume in volumes.items():
+        expected, _ = score_reconstruction(volume, truth)
+        assert {name: result.poses[str(count)][name] for name in expected} == expected
+    assert result.poses["1"]["iou"] == result.poses["8"]["iou"] != result.poses["2"]["iou"]
 
 
 def test_scoring_is_deterministic(tmp_path: Path, truth: Truth, box) -> None:

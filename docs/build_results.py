@@ -100,7 +100,7 @@ def exploration_table(kept: Mapping[str, Any]) -> str:
             seen.setdefault(entry["explorer"], entry)
     for name, entry in sorted(seen.items(), key=lambda item: -kept["touched_voxels"][item[0]]):
         recall = " / ".join(f"{entry['recall'][count]:.3f}" for count in POSES)
-        area = entry["aggregate"]["exploration"]["exploration_area"]
+        area = entry["aggregate"]["areas"]["exploration_area"]
         lines.append(f"| `{name}` | {kept['touched_voxels'][name]:.0f} | {recall} | {_interval(area)} |")
     return "\n".join(lines)
 

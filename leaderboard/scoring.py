@@ -51,6 +51,8 @@ SCORE_VERSION: Final = 2
 """Version of the score file's layout."""
 CURVE_SPACING: Final = 10
 """Control steps between the stored samples of an exploration curve."""
+FULL_ENTRY_SEEDS: Final = 3
+"""Fewest seeds of a full entry on the test split."""
 VOXEL_HALF_DIAGONAL: Final = VOXEL_EDGE * np.sqrt(3) / 2
 PLAUSIBLE_SLACK: Final = 2e-3
 """A touched voxel holds a contact point, which lies on the collision hulls; this much (m) is allowed for the error of
@@ -434,6 +436,8 @@ def _notes(
     notes = []
     if tuple(names) != object_set(submission.info.object_set):
         notes.append(f"scored on chosen objects ({len(names)}), not on the object set {submission.info.object_set!r}")
+    if submission.info.object_set == "test" and len(submission.info.seeds) < FULL_ENTRY_SEEDS:
+        notes.append(f"not a full entry: {len(submission.info.seeds)} of at least {FULL_ENTRY_SEEDS} seeds")
     empty: dict[str, list[str]] = {}
     for result in results:
         where = f"{result.object}, seed {result.seed}"

@@ -410,6 +410,20 @@ def test_score_prints_json(run: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert json.loads(capsys.readouterr().out)["objects"] == ["mug"]
 
 
+@pytest.mark.parametrize(
+    ("object_set", "seeds", "full"), [("test", (0,), False), ("test", (0, 1, 2), True), ("quick", (0,), True)]
+)
+def test_an_entry_of_few_seeds_says_so(object_set, seeds, full: bool, tmp_path: Path, cache: Path) -> None:
+    with SubmissionWriter(tmp_path / "s", info("mine", "hull", object_set=object_set, seeds=seeds)):
+        pass
+    notes = score_submission(tmp_path / "s", ["mug"], cache=cache).notes
+    assert any("not a full entry" in note for note in notes) is not full
+    assert any(
+        "missing, counted as empty: rollout of pose 0" in note for note in notes
+    )  # all pieces are, and are named
+    assert any("reconstruction of 1 pose, reconstruction of 2 poses" in note for note in notes)
+
+
 def test_each_score_is_written_as_soon_as_it_is_there(run: Path, tmp_path: Path) -> None:
     """The second submission is refused; the first one's score is there all the same."""
     (tmp_path / "broken").mkdir()

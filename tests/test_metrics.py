@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import igl
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.leaderboard import metrics
+from tslam_bench.leaderboard import metrics, prediction
 from tslam_bench.leaderboard.prediction import MESH_BOUND, prepare
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.sampling import iou_cells, iou_points
@@ -368,6 +369,22 @@ def test_invalid_predictions_count_as_empty(mesh, reason: str) -> None:
     assert reason in (prediction.reason or "")
     assert not prediction.solid.any()
     assert prediction.points.shape == prediction.normals.shape == (0, 3)
+
+
+@pytest.mark.parametrize("most_work", [0, 50_000_000])
+def test_inside_a_mesh_is_by_winding_number_wherever_the_point_is(torus, most_work: int, monkeypatch) -> None:
+    """A torus, a ball in its middle that is hollow, and a ball that overlaps the torus: cells and regions of every kind."""
+    hollow = trimesh.creation.icosphere(subdivisions=2, radius=0.01)
+    hollow.invert()
+    overlapping = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    overlapping.apply_translation([0.045, 0, 0])
+    parts = [trimesh.Trimesh(torus.vertices, torus.faces), trimesh.creation.icosphere(radius=0.02), hollow, overlapping]
+    mesh = trimesh.util.concatenate(parts)
+    monkeypatch.setattr(prediction, "_MOST_WORK", most_work)
+    points = rng().uniform(-0.08, 0.08, (4000, 3))
+    winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64), points)
+    assert {0, 1, 2} == set(np.unique(winding.round().astype(int)))
+    np.testing.assert_array_equal(prediction.solid_in_mesh(mesh, points), winding >= 0.5)
 
 
 def test_inverted_mesh_counts_as_empty() -> None:

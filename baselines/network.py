@@ -77,9 +77,9 @@ class PatchTrunk(nn.Module):
 
     def forward(self, grid: Tensor) -> Tensor:
         """(n, 8192) uint8 -> (n, out_features)."""
-        features = grid.float() * COUNT_SCALE
+        features = grid.float().mul_(COUNT_SCALE)
         for layer, width in zip(self.layers, self._widths, strict=True):
-            features = torch.relu(layer(features.view(-1, width)))
+            features = layer(features.view(-1, width)).relu_()
         return features.view(len(grid), -1)
 
 
@@ -123,7 +123,7 @@ class ConvolutionTrunk(nn.Module):
     def convolve(self, voxels: Tensor) -> Tensor:
         """(n, 2, 32, 32, 32) float32 -> (n, out_features)."""
         for layer in self.layers:
-            voxels = torch.relu(layer(voxels))
+            voxels = layer(voxels).relu_()
         return voxels.flatten(1)
 
 
@@ -193,7 +193,7 @@ class PolicyNetwork(nn.Module):
 def _mlp(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ReLU()]
+        layers += [nn.Linear(inputs, width), nn.ReLU(inplace=True)]
         inputs = width
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))
 

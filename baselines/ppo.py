@@ -281,7 +281,7 @@ class PPO:
         operations wait for each other hundreds of times per minibatch instead, for long if other work keeps a core busy.
         """
         parts = chosen.tensor_split(self._parts)
-        results = list(self._pool.map(self._gradients, [samples.rows(part) for part in parts]))
+        results = list(self._pool.map(lambda part: self._gradients(samples.rows(part)), parts))
         shares = [len(part) / len(chosen) for part in parts]
         for index, parameter in enumerate(self.network.parameters()):
             parameter.grad = _sum(

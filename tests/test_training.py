@@ -118,7 +118,8 @@ def test_submission_of_a_trained_model_states_its_budget(straight: Path, tmp_pat
     assert info.control_mode == "pd_joint_pos"
     actions = np.load(next((tmp_path / "rollouts" / "tslam" / "phone").glob("*.npz")))["actions"]
     held = actions.reshape(HORIZON // 20, 20, -1)
-    assert (held == held[:, :1]).all() and not (held[1:, 0] == held[:-1, 0]).any()
+    assert (held == held[:, :1]).all()
+    assert (held[1:, 0] != held[:-1, 0]).any(axis=1).all()  # a joint may well be at its limit twice
     other = tmp_path / "other"
     shutil.copytree(straight, other)
     train(replace(CONFIG, seed=5, steps=400), tmp_path / "second")

@@ -128,7 +128,7 @@ class HeuristicBaseline:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
         c = self.config
         qpos = np.asarray(check_observation(observation, len(self._phase)), dtype=np.float64)
-        self._advance(qpos, np.asarray(observation["touch"])[:, _PALM].any(axis=1))
+        self._advance(qpos, np.any(np.asarray(observation["touch"])[:, _PALM], axis=1))
         rows = np.arange(len(qpos))
         side, forward, roll, fan, depth, *wrist = self._spots[rows, self._spot % c.spots].T
         grip = (self._spot * c.squeezes + self._squeeze) % (c.spots * c.squeezes)

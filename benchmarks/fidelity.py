@@ -20,7 +20,7 @@ from mujoco_peer import MujocoSettings, build_model
 from numpy.typing import NDArray
 from penetration import pressing_audits, statistics_of
 from report import machine, markdown_table, print_table, replace_section, write_json
-from rollouts import HEIGHT, TEN_OBJECTS, THIN_OBJECTS, Hands, exploring_actions
+from rollouts import HEIGHT, KINDS, TEN_OBJECTS, THIN_OBJECTS, Hands, exploring_actions
 from touch_audit import audit
 from tqdm import tqdm
 from tunnelling import WallCounts, crossings
@@ -207,11 +207,9 @@ def penetration_rows(config: Config) -> Found:
 def wall_rows(config: Config) -> Found:
     """Fingers at thin walls."""
     rows = []
-    for label, pressing, steps in (
-        ("random", False, config.wall_steps),
-        ("pressing", True, config.pressing_wall_steps),
-    ):
-        counts = {name: asdict(count) for name, count in crossings(config.thin_objects, pressing, steps).items()}
+    for label in KINDS:
+        steps = config.wall_steps if label.startswith("random") else config.pressing_wall_steps
+        counts = {name: asdict(count) for name, count in crossings(config.thin_objects, label, steps).items()}
         counts["**all**"] = {key: sum(count[key] for count in counts.values()) for key in asdict(WallCounts())}
         for name, count in counts.items():
             rows.append(

@@ -14,17 +14,19 @@ the signed-distance field has sorted out those that cannot meet the object.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from rollouts import Hands, PressingHands, exploring_actions
+from rollouts import KINDS, Hands, make_actor
 from scipy.spatial import ConvexHull
 
 from tslam_bench import grids
 from tslam_bench.assets.hand import load_hand
 from tslam_bench.assets.store import PreparedObject, load_object
-from tslam_bench.constants import HORIZON, NUM_JOINTS, SUBSTEPS
+from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.tasks.batch import BatchSettings
 from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
@@ -52,6 +54,11 @@ class WallCounts:
     jumps: int = 0
     incidents: int = 0
 
+    def __add__(self, other: WallCounts) -> WallCounts:
+        """Both together."""
+        mine, theirs = asdict(self), asdict(other)
+        return WallCounts(**{key: mine[key] + theirs[key] for key in mine})
+
 
 class HullUnion:
     """Exact clipping of line segments against an object's hulls, in the object's frame (m)."""
@@ -63,15 +70,7 @@ class HullUnion:
         padded = np.stack([equations[np.minimum(np.arange(most), len(equations) - 1)] for equations in planes])
         self._normal, self._offset = padded[..., :3], padded[..., 3]
         field = prepared.field
-        self._values, self._origin, self._spacing = field.values, np.asarray(field.origin), field.spacing
-        self._last_cell = np.array(field.values.shape) - 1
-
-    def at_least(self, points: NDArray) -> NDArray[np.float64]:
-        """(n,) a lower bound of the distance (m) of points (n, 3) from the hulls."""
-        cell = ((points - self._origin) * (1.0 / self._spacing) + 0.5).astype(int)
-        x, y, z = np.minimum(np.maximum(cell, 0), self._last_cell).T
-        # The nearest sample is at most half a cell's diagonal away; beyond the field's box it is nearer to the object.
-        return self._values[x, y, z] - 0.87 * self._spacing
+        self.field = np.ascontiguousarray(field.values, dtype=np.float64), np.asarray(field.origin), field.spacing
 
     def crossed(self, start: NDArray, end: NDArray) -> NDArray[np.bool_]:
         """(n,) bool: whether segments (n, 3) to (n, 3) have a point inside a hull."""
@@ -90,90 +89,144 @@ class HullUnion:
 
 
 class AxisWatch:
-    """Watches one hand on one object: call :meth:`count` after every physics step."""
+    """Watches hands on one object: call :meth:`count` with where the links were after each physics step.
 
-    def __init__(self, union: HullUnion, pose: int) -> None:
+    Args:
+        union: the object.
+        poses: of the object, one per hand.
+    """
+
+    def __init__(self, union: HullUnion, poses: Sequence[int]) -> None:
         probes = build_skin(load_hand().shapes).probes
         on_axis = probes.radius > 0  # boxes have their probes on their faces
         self._link, self._local = probes.link[on_axis], probes.position[on_axis].astype(np.float64)
         self._joined = np.flatnonzero(self._link[1:] == self._link[:-1])  # each with the next one
         between = self._local[self._joined + 1] - self._local[self._joined]
         self._gap = np.linalg.norm(between, axis=1) + 1e-5  # rigid links: the distance never changes, but for rounding
-        self._union, self._turn = union, grids.pose_rotation(pose).astype(np.float64)
+        self._union = union
+        self._turn = np.stack([grids.pose_rotation(pose) for pose in poses]).astype(np.float64)
         self._last: NDArray | None = None
-        self._quiet = QUIET_STEPS
+        self._quiet = np.full(len(poses), QUIET_STEPS)
 
     def count(self, link_matrices: NDArray, counts: WallCounts) -> None:
-        """Adds what is seen after a physics step, for skin link poses (L, 3, 4) in the world."""
+        """Adds what is seen after S physics steps, for skin link poses (E, S, L, 3, 4) in the world."""
         inside, jumped = self.look(link_matrices)
-        counts.inside += inside
-        counts.jumps += jumped
-        if inside or jumped:
-            counts.incidents += self._quiet >= QUIET_STEPS
-            self._quiet = 0
-        else:
-            self._quiet += 1
+        counts.inside += int(inside.sum())
+        counts.jumps += int(jumped.sum())
+        for seen in (inside | jumped).T:
+            counts.incidents += int((seen & (self._quiet >= QUIET_STEPS)).sum())
+            self._quiet = np.where(seen, 0, self._quiet + 1)
 
-    def look(self, link_matrices: NDArray) -> tuple[bool, bool]:
-        """(an axis is inside, an axis jumped) for skin link poses (L, 3, 4) in the world."""
-        poses = link_matrices[self._link].astype(np.float64)
-        world = np.einsum("pij,pj->pi", poses[:, :, :3], self._local) + poses[:, :, 3]
-        points = world @ self._turn  # into the object's frame: the turn's inverse
-        inside = jumped = False
-        clear = self._union.at_least(points)
-        joined = self._joined[clear[self._joined] < self._gap]
-        if len(joined):
-            inside = bool(self._union.crossed(points[joined], points[joined + 1]).any())
-        if self._last is not None:
-            moved = points - self._last
-            near = clear * np.abs(clear) < np.einsum("pk,pk->p", moved, moved)
-            if near.any():
-                start, end = self._last[near], points[near]
-                outside = ~self._union.contains(start) & ~self._union.contains(end)
-                jumped = bool((self._union.crossed(start, end) & outside).any())
-        self._last = points
+    def look(self, link_matrices: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(E, S) an axis is inside, (E, S) an axis jumped, for skin link poses (E, S, L, 3, 4) in the world."""
+        shape = (*link_matrices.shape[:2], len(self._link))
+        points, clear = np.empty((*shape, 3)), np.empty(shape)
+        _place(link_matrices, self._link, self._local, self._turn, *self._union.field, points, clear)
+        inside, jumped = np.zeros(shape[:2], dtype=bool), np.zeros(shape[:2], dtype=bool)
+
+        near = clear[..., self._joined] < self._gap
+        if near.any():
+            env, step, which = np.nonzero(near)
+            first = self._joined[which]
+            crossed = self._union.crossed(points[env, step, first], points[env, step, first + 1])
+            inside[env[crossed], step[crossed]] = True
+
+        before = points[:, :1] if self._last is None else self._last[:, None]
+        before = np.concatenate([before, points[:, :-1]], axis=1)
+        moved = np.square(points - before).sum(axis=-1)
+        near = clear * np.abs(clear) < moved
+        if near.any():
+            start, end = before[near], points[near]
+            outside = ~self._union.contains(start) & ~self._union.contains(end)
+            crossed = self._union.crossed(start, end) & outside
+            env, step, _ = np.nonzero(near)
+            jumped[env[crossed], step[crossed]] = True
+        self._last = points[:, -1]
         return inside, jumped
 
 
-def count_crossings(name: str, pressing: bool, control_steps: int, num_envs: int = 16) -> WallCounts:
-    """Hands on one object for at least ``control_steps``: random ones, or ones that press on it."""
-    union = HullUnion(load_object(name))
-    hands = Hands(num_envs, BatchSettings(object=name, reward_mode="none"))
-    counts, generator = WallCounts(), np.random.Generator(np.random.PCG64(0))
-    rows, links = hands.scenes[0].skin_rows(), np.zeros((1, len(SKIN_LINKS), 3, 4), dtype=np.float32)
-    joints = np.zeros((2, NUM_JOINTS), dtype=np.float32)
-    poses = np.zeros((1, hands.scenes[0].num_bodies, POSE_SIZE), dtype=np.float32)
-    watches: list[AxisWatch] = []
+@njit(cache=True)
+def _place(
+    matrices: Any, link: Any, local: Any, turn: Any, values: Any, origin: Any, spacing: Any, points: Any, clear: Any
+) -> None:
+    """Writes (E, S, P, 3) ``points`` in the object's frame and (E, S, P) ``clear``, at most their distance from the hulls (m)."""
+    world = np.zeros(3)
+    for env in range(matrices.shape[0]):
+        for step in range(matrices.shape[1]):
+            for probe in range(len(link)):
+                pose = matrices[env, step, link[probe]]
+                for row in range(3):
+                    world[row] = pose[row, 3]
+                    for column in range(3):
+                        world[row] += pose[row, column] * local[probe, column]
+                index = (0, 0, 0)
+                for axis in range(3):
+                    value = 0.0
+                    for row in range(3):  # into the object's frame: the turn's inverse
+                        value += world[row] * turn[env, row, axis]
+                    points[env, step, probe, axis] = value
+                    cell = int(np.floor((value - origin[axis]) / spacing + 0.5))
+                    cell = min(max(cell, 0), values.shape[axis] - 1)
+                    if axis == 0:
+                        index = (cell, 0, 0)
+                    elif axis == 1:
+                        index = (index[0], cell, 0)
+                    else:
+                        index = (index[0], index[1], cell)
+                # The nearest sample is at most half a cell's diagonal away; beyond the field's box it is nearer to the object.
+                clear[env, step, probe] = values[index] - 0.87 * spacing
 
-    def watched(env: int) -> Callable[[], None]:
+
+def count_crossings(
+    name: str, kind: str, control_steps: int, settings: BatchSettings, num_envs: int = 16, seed: int = 0
+) -> WallCounts:
+    """Hands on one object for at least ``control_steps``.
+
+    Args:
+        name: the object.
+        kind: how the hands act, one of ``rollouts.KINDS``; it decides the control mode.
+        control_steps: of all hands together.
+        settings: split and physics.
+        num_envs: hands.
+        seed: of the first episode and its actions.
+    """
+    union = HullUnion(load_object(name, settings.split))
+    hands = Hands(num_envs, replace(settings, object=name, objects=None, reward_mode="none", control_mode=KINDS[kind]))
+    counts, substeps = WallCounts(), settings.physics.substeps
+    rows = hands.scenes[0].skin_rows()
+    joints = np.zeros((2, NUM_JOINTS), dtype=np.float32)
+    bodies = np.zeros((num_envs, substeps, hands.scenes[0].num_bodies, POSE_SIZE), dtype=np.float32)
+    links = np.zeros((num_envs, substeps, len(SKIN_LINKS), 3, 4), dtype=np.float32)
+
+    def recorded(env: int) -> Callable[[], None]:
         scene = hands.scenes[env]
 
         def step() -> None:
-            for _ in range(SUBSTEPS):
-                scene._system.step()
-                scene.read(*joints, poses[0])
-                link_matrices(poses, rows, links)
-                watches[env].count(links[0], counts)
+            for index in range(substeps):
+                scene.substep()
+                scene.read(*joints, bodies[env, index])
 
         return step
 
     for env in range(num_envs):
-        hands.scenes[env].step = watched(env)
-    episode = 0
+        hands.scenes[env].step = recorded(env)
     while counts.control_steps < control_steps:
-        hands.reset(episode * num_envs)
-        watches[:] = [AxisWatch(union, pose) for pose in hands.batch.pose]
-        press = PressingHands(num_envs, episode)
+        hands.reset(seed * num_envs)
+        watch, actor = AxisWatch(union, hands.batch.pose), make_actor(kind, num_envs, seed)
         for index in range(HORIZON - 1):  # the last step would start the next episode
-            explore = exploring_actions(generator, num_envs, index)
-            hands.step(press(index, hands.arrays["qpos"]) if pressing else explore)
+            hands.step(actor(index, hands.arrays["qpos"]))
+            link_matrices(bodies.reshape(-1, *bodies.shape[2:]), rows, links.reshape(-1, *links.shape[2:]))
+            watch.count(links, counts)
             counts.control_steps += num_envs
             counts.contact_steps += int(hands.arrays["touch"].any(axis=1).sum())
-        episode += 1
+        seed += 1
     return counts
 
 
-def crossings(objects: Sequence[str], pressing: bool, control_steps: int) -> dict[str, WallCounts]:
+def crossings(
+    objects: Sequence[str], kind: str, control_steps: int, settings: BatchSettings | None = None, seed: int = 0
+) -> dict[str, WallCounts]:
     """Counts per object, ``control_steps`` in all."""
     share = -(-control_steps // len(objects))
-    return {name: count_crossings(name, pressing, share) for name in objects}
+    settings = settings or BatchSettings(split="test")
+    return {name: count_crossings(name, kind, share, settings, seed=seed) for name in objects}

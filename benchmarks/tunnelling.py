@@ -65,27 +65,61 @@ class HullUnion:
 
     def __init__(self, prepared: PreparedObject) -> None:
         planes = [ConvexHull(vertices).equations for vertices, _ in prepared.hulls]
-        most = max(len(equations) for equations in planes)
-        # Hulls with fewer planes repeat their last one.
-        padded = np.stack([equations[np.minimum(np.arange(most), len(equations) - 1)] for equations in planes])
-        self._normal, self._offset = padded[..., :3], padded[..., 3]
+        self._planes = np.concatenate(planes)
+        self._first = np.concatenate([[0], np.cumsum([len(equations) for equations in planes])])
         field = prepared.field
         self.field = np.ascontiguousarray(field.values, dtype=np.float64), np.asarray(field.origin), field.spacing
 
     def crossed(self, start: NDArray, end: NDArray) -> NDArray[np.bool_]:
         """(n,) bool: whether segments (n, 3) to (n, 3) have a point inside a hull."""
-        before = np.einsum("hpk,nk->nhp", self._normal, start) + self._offset
-        rise = np.einsum("hpk,nk->nhp", self._normal, end - start)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = -before / rise
-        enter = np.where(rise < 0, at, np.where((rise == 0) & (before > 0), np.inf, -np.inf)).max(axis=2)
-        leave = np.where(rise > 0, at, np.inf).min(axis=2)
-        return (np.maximum(enter, 0.0) < np.minimum(leave, 1.0)).any(axis=1)
+        return _crossed(self._planes, self._first, start, end)
 
     def contains(self, points: NDArray) -> NDArray[np.bool_]:
         """(n,) bool: whether points (n, 3) lie inside a hull."""
-        distance = np.einsum("hpk,nk->nhp", self._normal, points) + self._offset
-        return (distance < 0).all(axis=2).any(axis=1)
+        return _contains(self._planes, self._first, points)
+
+
+@njit(cache=True)
+def _crossed(planes: Any, first: Any, start: Any, end: Any) -> Any:
+    found = np.zeros(len(start), dtype=np.bool_)
+    for segment in range(len(start)):
+        a, b = start[segment], end[segment]
+        for hull in range(len(first) - 1):
+            enter, leave = 0.0, 1.0
+            for index in range(first[hull], first[hull + 1]):
+                n = planes[index]
+                before = n[0] * a[0] + n[1] * a[1] + n[2] * a[2] + n[3]
+                rise = n[0] * (b[0] - a[0]) + n[1] * (b[1] - a[1]) + n[2] * (b[2] - a[2])
+                if rise < 0:
+                    enter = max(enter, -before / rise)
+                elif rise > 0:
+                    leave = min(leave, -before / rise)
+                elif before > 0:
+                    leave = -1.0
+                if enter >= leave:
+                    break
+            if enter < leave:
+                found[segment] = True
+                break
+    return found
+
+
+@njit(cache=True)
+def _contains(planes: Any, first: Any, points: Any) -> Any:
+    found = np.zeros(len(points), dtype=np.bool_)
+    for point in range(len(points)):
+        p = points[point]
+        for hull in range(len(first) - 1):
+            inside = True
+            for index in range(first[hull], first[hull + 1]):
+                n = planes[index]
+                if n[0] * p[0] + n[1] * p[1] + n[2] * p[2] + n[3] >= 0:
+                    inside = False
+                    break
+            if inside:
+                found[point] = True
+                break
+    return found
 
 
 class AxisWatch:
@@ -159,22 +193,30 @@ def _place(
                     world[row] = pose[row, 3]
                     for column in range(3):
                         world[row] += pose[row, column] * local[probe, column]
-                index = (0, 0, 0)
                 for axis in range(3):
                     value = 0.0
                     for row in range(3):  # into the object's frame: the turn's inverse
                         value += world[row] * turn[env, row, axis]
                     points[env, step, probe, axis] = value
-                    cell = int(np.floor((value - origin[axis]) / spacing + 0.5))
-                    cell = min(max(cell, 0), values.shape[axis] - 1)
-                    if axis == 0:
-                        index = (cell, 0, 0)
-                    elif axis == 1:
-                        index = (index[0], cell, 0)
-                    else:
-                        index = (index[0], index[1], cell)
-                # The nearest sample is at most half a cell's diagonal away; beyond the field's box it is nearer to the object.
-                clear[env, step, probe] = values[index] - 0.87 * spacing
+                clear[env, step, probe] = _at_least(points[env, step, probe], values, origin, spacing)
+
+
+@njit(cache=True)
+def _at_least(point: Any, values: Any, origin: Any, spacing: Any) -> float:
+    """A lower bound of a point's distance from the hulls (m): distances change no faster than places."""
+    corner = np.empty(3, dtype=np.int64)
+    for axis in range(3):
+        cell = int(np.floor((point[axis] - origin[axis]) / spacing))
+        corner[axis] = min(max(cell, 0), values.shape[axis] - 2)
+    bound = -np.inf
+    for x in range(corner[0], corner[0] + 2):
+        for y in range(corner[1], corner[1] + 2):
+            for z in range(corner[2], corner[2] + 2):
+                dx = point[0] - origin[0] - x * spacing
+                dy = point[1] - origin[1] - y * spacing
+                dz = point[2] - origin[2] - z * spacing
+                bound = max(bound, values[x, y, z] - np.sqrt(dx * dx + dy * dy + dz * dz))
+    return bound
 
 
 def count_crossings(

@@ -49,13 +49,14 @@ GIVE_UP: Final = 3
 """Incidents of random hands within the screen after which a setting is given up."""
 ARRIVAL_STEPS: Final = 133
 """Control steps (4 s) that drives have for reaching a target."""
-TODAY: Final = PhysicsSettings(4, 4, 0.04, 60.0, 2e-3)
+TODAY: Final = PhysicsSettings(4, 4, 0.04, 60.0, 2e-3, persistent_contacts=True)
 """What the settings are compared with: the first version of the benchmark."""
 
 
 def _grid() -> tuple[PhysicsSettings, ...]:
-    solvers = ((4, 4), (3, 5), (2, 8), (2, 6))
-    return tuple(PhysicsSettings(s, i, step, 60.0, 2e-3) for s, i in solvers for step in (0.04, 0.02, 0.013))
+    solvers, steps = ((4, 4), (3, 5), (2, 8), (2, 6)), (0.04, 0.02, 0.013)
+    grid = (PhysicsSettings(s, i, step, 60.0, 2e-3) for s, i in solvers for step in steps)
+    return TODAY, *grid
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,13 @@ class Config:
     """Measures settings of the physics."""
 
     settings: tuple[str, ...] = ()
-    """Settings as substeps x iterations x arm step (mm) x arm force (N) [x contact offset (mm)], such as ``2x8x20x60``;
-    none: the grid of 4x4, 3x5, 2x8, 2x6 with 40, 20 and 13 mm."""
+    """Settings as substeps x iterations x arm step (mm) x arm force (N) [x contact offset (mm)], such as ``2x8x20x60``, and
+    ``+`` behind it for persistent contact manifolds; none: the grid of 4x4, 3x5, 2x8, 2x6 with 40, 20 and 13 mm."""
     journal: Path = Path("physics_settings.jsonl")
     """File with a line per measurement; what is there is not measured again."""
     objects: tuple[str, ...] = TRAIN_OBJECTS
     """Train objects that are pressed on and explored."""
-    poses: int = 4
+    poses: int = 8
     """Pressing episodes per object and control mode."""
     thin_objects: tuple[str, ...] = THIN_OBJECTS
     """Test objects whose walls are watched."""
@@ -85,9 +86,9 @@ class Config:
 
 def parse_setting(text: str) -> PhysicsSettings:
     """A setting as on the command line. Raises ValueError."""
-    substeps, iterations, step, force, *more = text.split("x")
+    substeps, iterations, step, force, *more = text.rstrip("+").split("x")
     offset = 1e-3 * float(more[0]) if more else TODAY.contact_offset
-    return PhysicsSettings(int(substeps), int(iterations), 1e-3 * float(step), float(force), offset)
+    return PhysicsSettings(int(substeps), int(iterations), 1e-3 * float(step), float(force), offset, text.endswith("+"))
 
 
 def label(setting: PhysicsSettings) -> tuple[str, ...]:
@@ -95,6 +96,8 @@ def label(setting: PhysicsSettings) -> tuple[str, ...]:
     solver = f"{setting.substeps} x {setting.position_iterations}"
     if setting.contact_offset != TODAY.contact_offset:
         solver += f", offset {1e3 * setting.contact_offset:g} mm"
+    if setting.persistent_contacts:
+        solver += ", persistent"
     return solver, f"{1e3 * setting.arm_step:g}", f"{setting.arm_force:g}"
 
 

@@ -204,18 +204,19 @@ def _place(
 @njit(cache=True)
 def _at_least(point: Any, values: Any, origin: Any, spacing: Any) -> float:
     """A lower bound of a point's distance from the hulls (m): distances change no faster than places."""
-    corner = np.empty(3, dtype=np.int64)
+    corner, offset = np.empty(3, dtype=np.int64), np.empty(3)
     for axis in range(3):
-        cell = int(np.floor((point[axis] - origin[axis]) / spacing))
-        corner[axis] = min(max(cell, 0), values.shape[axis] - 2)
+        last = values.shape[axis] - 1
+        # Beyond the field's box a point is no nearer to the object than its nearest point of the box.
+        at = min(max((point[axis] - origin[axis]) / spacing, 0.0), float(last))
+        corner[axis] = min(int(at), last - 1)
+        offset[axis] = at - corner[axis]
     bound = -np.inf
-    for x in range(corner[0], corner[0] + 2):
-        for y in range(corner[1], corner[1] + 2):
-            for z in range(corner[2], corner[2] + 2):
-                dx = point[0] - origin[0] - x * spacing
-                dy = point[1] - origin[1] - y * spacing
-                dz = point[2] - origin[2] - z * spacing
-                bound = max(bound, values[x, y, z] - np.sqrt(dx * dx + dy * dy + dz * dz))
+    for x in range(2):
+        for y in range(2):
+            for z in range(2):
+                away = np.sqrt((offset[0] - x) ** 2 + (offset[1] - y) ** 2 + (offset[2] - z) ** 2)
+                bound = max(bound, values[corner[0] + x, corner[1] + y, corner[2] + z] - away * spacing)
     return bound
 
 

@@ -17,9 +17,11 @@ from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS, TABLE_SIZE
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT
 
-SOLVER_POSITION_ITERATIONS: Final = 4
+SOLVER_POSITION_ITERATIONS: Final = 8
 SOLVER_VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET: Final = 2e-3
+PERSISTENT_CONTACTS: Final = False
+"""PhysX's persistent contact manifolds lose contacts of moving fingers with thin walls (``docs/fidelity.md``)."""
 REST_OFFSET: Final = 0.0
 GRAVITY: Final = (0.0, 0.0, -9.81)
 """The hand is gravity-compensated and the object fixed, so this moves nothing yet."""
@@ -46,6 +48,7 @@ class PhysicsSettings:
         arm_step: how far a translation's target may be ahead of its joint (m per control step), in both control modes.
         arm_force: largest force of a translation's drive (N).
         contact_offset: distance (m) from which contacts are made.
+        persistent_contacts: whether contact manifolds are kept from step to step (PCM) or made anew.
 
     Raises:
         InvalidInputError: a number that is not above 0.
@@ -56,10 +59,11 @@ class PhysicsSettings:
     arm_step: float = float(DELTA_STEP[0])
     arm_force: float = float(FORCE_LIMIT[0])
     contact_offset: float = CONTACT_OFFSET
+    persistent_contacts: bool = PERSISTENT_CONTACTS
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not value > 0:
+            if name != "persistent_contacts" and not value > 0:
                 raise InvalidInputError(f"{name} {value!r}: must be above 0")
 
     @property
@@ -99,7 +103,7 @@ def configure(settings: PhysicsSettings = PROTOCOL) -> None:
     physx.set_scene_config(
         gravity=np.array(GRAVITY),
         bounce_threshold=BOUNCE_THRESHOLD,
-        enable_pcm=True,
+        enable_pcm=settings.persistent_contacts,
         enable_tgs=True,
         enable_ccd=False,
         enable_enhanced_determinism=False,

@@ -170,6 +170,7 @@ class TactileSLAMEnv(BaseEnv):
                 solver_position_iterations=physics.PROTOCOL.position_iterations,
                 solver_velocity_iterations=physics.SOLVER_VELOCITY_ITERATIONS,
                 enable_tgs=True,
+                enable_pcm=physics.PROTOCOL.persistent_contacts,
             ),
             default_materials_config=DefaultMaterialsConfig(
                 physics.STATIC_FRICTION, physics.DYNAMIC_FRICTION, physics.RESTITUTION

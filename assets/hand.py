@@ -2,7 +2,9 @@
 
 MuJoCo compiles the model and the compiled numbers are written out, because reading the MJCF directly loses includes,
 inertias and collision masks. ARRx and ARRy are dropped, the arm becomes a chain of three slides and one hinge, and
-marker geoms without a ``C_`` name are not colliders. Needs ``mujoco``, here only.
+marker geoms without a ``C_`` name are not colliders. Every capsule carries a sphere of its own radius in the end that is farther
+from its joint: the shape stays the same, but PhysX finds the contacts of a fingertip that it misses with the capsule alone
+(``docs/fidelity.md``). Needs ``mujoco``, here only.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 from tslam_bench.errors import AssetError
 from tslam_bench.files import atomic_directory, cache_directory, sha256_file
 
-HAND_VERSION = 1
+HAND_VERSION = 2
 """Bumped whenever the conversion writes other files."""
 URDF_NAME = "adroit28.urdf"
 SHAPES_NAME = "shapes.json"
@@ -167,6 +169,8 @@ def _convert(xml: Path, folder: Path) -> None:
                 _visual(link, model, int(geom), xml.parent / "resources" / "meshes", meshes)
             elif model.geom(geom).name.startswith("C_"):
                 shapes.append(_collision(link, model, int(geom), name))
+                if shapes[-1].kind == "capsule":
+                    _far_end(link, shapes[-1])
         if body != forearm:
             (joint,) = np.flatnonzero(model.jnt_bodyid == body)
             parent_name = model.body(model.body_parentid[body]).name
@@ -247,6 +251,16 @@ def _collision(link: ElementTree.Element, model: Any, geom: int, name: str) -> C
     else:
         ElementTree.SubElement(geometry, "box", size=_numbers(2 * size))
     return CollisionShape(name, kind, *(tuple(float(v) for v in values) for values in (size, position, quaternion)))
+
+
+def _far_end(link: ElementTree.Element, capsule: CollisionShape) -> None:
+    """Adds a sphere at a capsule's end that is farther from the link's joint, as a collision shape of the link."""
+    axis = _rotation(capsule.quaternion)[:, 2] * capsule.size[1]
+    ends = [np.array(capsule.position) + sign * axis for sign in (-1, 1)]
+    collision = ElementTree.SubElement(link, "collision")
+    _origin(collision, max(ends, key=lambda end: float(np.linalg.norm(end))), np.eye(3))
+    geometry = ElementTree.SubElement(collision, "geometry")
+    ElementTree.SubElement(geometry, "sphere", radius=repr(capsule.size[0]))
 
 
 def _visual(link: ElementTree.Element, model: Any, geom: int, source: Path, target: Path) -> None:

@@ -96,12 +96,18 @@ class GraspConfig:
 
 
 class HeuristicBaseline:
-    """See the module's docstring."""
+    """See the module's docstring.
+
+    Args:
+        config: numbers of the grasps.
+        step_limit: (28,) what an action of 1 adds to a joint's position (m or rad).
+    """
 
     control_mode = CONTROL_MODES[0]
 
-    def __init__(self, config: GraspConfig | None = None) -> None:
+    def __init__(self, config: GraspConfig | None = None, step_limit: NDArray[np.float64] = DELTA_STEP) -> None:
         self.config = config or GraspConfig()
+        self._step_limit = step_limit
         self.reset(1, 0)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
@@ -143,7 +149,7 @@ class HeuristicBaseline:
         heights = [safe, depth, self._stopped_at - c.press, self._stopped_at + c.rise / 2]
         goal[:, _HEIGHT] = np.select([self._phase == phase for phase in (_TRAVEL, _SINK, _CLOSE, _OPEN)], heights)
         goal = np.clip(goal, JOINT_LIMITS[:, 0], JOINT_LIMITS[:, 1])
-        return np.clip((goal - qpos) / DELTA_STEP, -1, 1).astype(np.float32)
+        return np.clip((goal - qpos) / self._step_limit, -1, 1).astype(np.float32)
 
     def _hand(self, closing: NDArray[np.bool_], curls: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 28) goals of fingers and thumb: closed by ``curls`` (n, 5), or open."""

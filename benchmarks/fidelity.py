@@ -20,7 +20,7 @@ from mujoco_peer import MujocoSettings, build_model
 from numpy.typing import NDArray
 from penetration import pressing_audits, statistics_of
 from report import machine, markdown_table, print_table, replace_section, write_json
-from rollouts import HEIGHT, TEN_OBJECTS, THIN_OBJECTS, Hands, exploring_actions
+from rollouts import HEIGHT, KINDS, TEN_OBJECTS, THIN_OBJECTS, Hands, exploring_actions
 from touch_audit import audit
 from tqdm import tqdm
 from tunnelling import WallCounts, crossings
@@ -31,6 +31,7 @@ from tslam_bench.hand_constants import DAMPING, DELTA_STEP, JOINT_LIMITS, JOINT_
 from tslam_bench.tasks.arrays import NumpyBackend
 from tslam_bench.tasks.batch import BatchSettings
 from tslam_bench.tasks.control import DriveTargets
+from tslam_bench.tasks.physics import PROTOCOL, PhysicsSettings
 
 JOINT_GROUPS: Final = {
     "arm (m)": slice(0, 3),
@@ -111,28 +112,32 @@ def rest_drift(steps: int = HORIZON - 1, num_envs: int = 8) -> tuple[float, floa
     return float(np.abs(hands.arrays["qpos"] - start).max()), fastest
 
 
-def tracking_errors(targets: int, num_envs: int = 8) -> NDArray[np.float64]:
-    """(n, 28) absolute distance from the target after one second in free space; random targets, ``targets`` per hand.
+def tracking_errors(
+    targets: int, num_envs: int = 8, physics: PhysicsSettings = PROTOCOL, steps: int = HOLD_STEPS
+) -> NDArray[np.float64]:
+    """(n, 28) absolute distance from the target after ``steps`` in free space; random targets, ``targets`` per hand.
 
     Hands that touch the object on their way to a target are left out for that target.
     """
-    settings = BatchSettings(object="cubesmall", control_mode="pd_joint_pos", reward_mode="none")
+    settings = BatchSettings(
+        object="cubesmall", split="test", control_mode="pd_joint_pos", reward_mode="none", physics=physics
+    )
     hands, generator = Hands(num_envs, settings), np.random.Generator(np.random.PCG64(0))
-    control = DriveTargets(settings.control_mode, NumpyBackend())
+    goal = DriveTargets(settings.control_mode, NumpyBackend(), step_limit=np.full(NUM_JOINTS, np.inf))
     errors = []
     hands.reset(0)
     up = np.zeros((num_envs, NUM_JOINTS), np.float32)
     up[:, HEIGHT] = 1.0
-    for _ in range(HOLD_STEPS):
+    for _ in range(steps):
         hands.step(up)
     for _ in range(targets):
         action = generator.uniform(-1, 1, (num_envs, NUM_JOINTS)).astype(np.float32)
         action[:, HEIGHT] = generator.uniform(0.9, 1.0, num_envs)  # above the object
         free = np.ones(num_envs, dtype=bool)
-        for _ in range(HOLD_STEPS):
+        for _ in range(steps):
             hands.step(action)
             free &= ~hands.arrays["touch"].any(axis=1)
-        wanted = control(action, hands.arrays["qpos"])
+        wanted = goal(action, hands.arrays["qpos"])
         errors.append(np.abs(hands.arrays["qpos"] - wanted)[free])
     return np.concatenate(errors).astype(np.float64)
 
@@ -207,11 +212,9 @@ def penetration_rows(config: Config) -> Found:
 def wall_rows(config: Config) -> Found:
     """Fingers at thin walls."""
     rows = []
-    for label, pressing, steps in (
-        ("random", False, config.wall_steps),
-        ("pressing", True, config.pressing_wall_steps),
-    ):
-        counts = {name: asdict(count) for name, count in crossings(config.thin_objects, pressing, steps).items()}
+    for label in KINDS:
+        steps = config.wall_steps if label.startswith("random") else config.pressing_wall_steps
+        counts = {name: asdict(count) for name, count in crossings(config.thin_objects, label, steps).items()}
         counts["**all**"] = {key: sum(count[key] for count in counts.values()) for key in asdict(WallCounts())}
         for name, count in counts.items():
             rows.append(

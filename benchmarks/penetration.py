@@ -21,7 +21,7 @@ import tyro
 from mujoco_peer import STIFF, MujocoSettings, mujoco_batches
 from numpy.typing import NDArray
 from report import machine, markdown_table, print_table, replace_section, write_json
-from rollouts import TEN_OBJECTS, Hands, PressingHands, run_episode
+from rollouts import KINDS, TEN_OBJECTS, Hands, make_actor, run_episode
 from separation import SeparationRuler
 from touch_audit import Audit
 
@@ -48,18 +48,25 @@ class Config:
     """Page whose section ``penetration`` is replaced by the table."""
 
 
-def pressing_audits(objects: Sequence[str], poses: int) -> dict[str, Audit]:
+def pressing_audits(
+    objects: Sequence[str], poses: int, settings: BatchSettings | None = None, kind: str = "pressing"
+) -> dict[str, Audit]:
     """The skin against the ruler's contacts, and the depth of every contact step, of hands that press on each object.
 
-    One episode per object and pose.
+    Args:
+        objects: names.
+        poses: episodes per object, each in another pose.
+        settings: split and physics; None means the test split and the protocol's.
+        kind: how the hands act, one of ``rollouts.KINDS``; it decides the control mode.
     """
     names = list(objects)
-    hands = Hands(len(names), BatchSettings(objects=tuple(names)))
+    settings = replace(settings or BatchSettings(split="test"), objects=tuple(names), control_mode=KINDS[kind])
+    hands = Hands(len(names), settings)
     counts = {name: np.zeros(3, dtype=np.int64) for name in names}  # both, skin only, ruler only
     depths: dict[str, list[float]] = {name: [] for name in names}
     for episode in range(poses):
         turned = [(episode + env) % NUM_POSES for env in range(len(names))]
-        rulers = [SeparationRuler(name, pose) for name, pose in zip(names, turned, strict=True)]
+        rulers = [SeparationRuler(name, pose, settings.split) for name, pose in zip(names, turned, strict=True)]
 
         def look(_: int, rulers: list[SeparationRuler] = rulers) -> None:
             for env, (name, ruler) in enumerate(zip(names, rulers, strict=True)):
@@ -69,7 +76,7 @@ def pressing_audits(objects: Sequence[str], poses: int) -> dict[str, Audit]:
                 if nearest < CONTACT_SEPARATION:
                     depths[name].append(max(0.0, -nearest))
 
-        run_episode(hands, 1000 * episode, PressingHands(len(names), episode), look, names, turned)
+        run_episode(hands, 1000 * episode, make_actor(kind, len(names), episode), look, names, turned)
     return {name: Audit(*(int(count) for count in counts[name]), np.array(depths[name])) for name in names}
 
 

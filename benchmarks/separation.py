@@ -23,12 +23,13 @@ class SeparationRuler:
     """Distances between the hand's shapes and an object's hulls, negative where they overlap.
 
     Args:
-        name: object of the test split.
+        name: the object.
         pose: 0..7.
+        split: its split.
     """
 
-    def __init__(self, name: str, pose: int) -> None:
-        self._model = build_model(load_hand().urdf, MujocoSettings(margin=REACH), load_object(name))
+    def __init__(self, name: str, pose: int, split: str = "test") -> None:
+        self._model = build_model(load_hand().urdf, MujocoSettings(margin=REACH), load_object(name, split))
         self._data = mujoco.MjData(self._model)
         self._data.mocap_quat[0] = physics.pose_quaternion(pose)
         self._joints = np.array([self._model.joint(joint).qposadr[0] for joint in JOINT_NAMES])

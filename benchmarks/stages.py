@@ -46,7 +46,8 @@ def stage_costs(num_envs: int, settings: BatchSettings, steps: int = HORIZON) ->
     for scene in batch._scenes:
         timed(scene, "set_targets", "drive targets")
         timed(scene, "step", "physics")
-    timed(batch, "_read", "reading state")
+        timed(scene, "read", "reading state")
+    timed(batch, "_gather", "reading state")
     timed(batch._sensing, "step", "sensing")
     timed(batch._sensing, "link_touch", "sensing")
     if batch._rewards is not None:

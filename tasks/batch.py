@@ -18,6 +18,7 @@ from tslam_bench.tasks.compiled_sensing import CompiledSensing
 from tslam_bench.tasks.control import DriveTargets
 from tslam_bench.tasks.hand_scene import BodyPool, HandScene
 from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
+from tslam_bench.tasks.physics import PROTOCOL, PhysicsSettings
 from tslam_bench.tasks.rewards import Rewards
 from tslam_bench.tasks.skin import build_skin
 from tslam_bench.tasks.starts import StartSampler
@@ -62,6 +63,7 @@ class BatchSettings:
     reward_mode: str = "tslam"
     control_mode: str = CONTROL_MODES[0]
     environment_id: str = ENVIRONMENT_ID
+    physics: PhysicsSettings = PROTOCOL
 
     def __post_init__(self) -> None:
         known = (*REWARD_MODES, "none")
@@ -88,14 +90,14 @@ class HandBatch:
 
     def __init__(self, num_envs: int, settings: BatchSettings, arrays: Mapping[str, NDArray]) -> None:
         hand, backend = load_hand(), NumpyBackend()
-        bodies = BodyPool()
+        bodies = BodyPool(settings.physics)
         self.num_envs = num_envs
         self._arrays = arrays
         self._starts = settings.sampler()
         table = self._starts.variant.table
         self._scenes = [HandScene(hand.urdf, bodies, table) for _ in range(num_envs)]
         self._sensing = CompiledSensing(num_envs, build_skin(hand.shapes), arrays["occupancy"])
-        self._targets = DriveTargets(settings.control_mode, backend)
+        self._targets = DriveTargets(settings.control_mode, backend, settings.physics.step_limit)
         self._rewards = Rewards(settings.reward_mode, num_envs, backend) if settings.reward_mode != "none" else None
         self._rngs: list[np.random.RandomState | None] = [None] * num_envs
         self._qpos = np.zeros((num_envs, NUM_JOINTS), dtype=np.float32)
@@ -168,11 +170,12 @@ class HandBatch:
     def _control_step(self) -> None:
         arrays = self._arrays
         targets = self._targets(arrays["action"], arrays["qpos"])
-        for scene, target in zip(self._scenes, targets.tolist(), strict=True):
+        # Hand by hand: what setting the targets brings into the processor's cache, the physics and the reading need again.
+        for env, (scene, target) in enumerate(zip(self._scenes, targets.tolist(), strict=True)):
             scene.set_targets(target)
-        for scene in self._scenes:
             scene.step()
-        self._read(range(self.num_envs))
+            self._read_scene(env)
+        self._gather()
         contacts = self._sensing.step(self._links, arrays["elapsed_steps"])
         arrays["elapsed_steps"][:] += 1
         arrays["reward"][:] = 0.0 if self._rewards is None else self._rewards.step(contacts)
@@ -201,7 +204,14 @@ class HandBatch:
     def _read(self, envs: Sequence[int]) -> None:
         """Reads joints and links of ``envs`` from their scenes."""
         for env in envs:
-            self._scenes[env].read(self._qpos[env], self._qvel[env], self._poses[env])
+            self._read_scene(env)
+        self._gather()
+
+    def _read_scene(self, env: int) -> None:
+        self._scenes[env].read(self._qpos[env], self._qvel[env], self._poses[env])
+
+    def _gather(self) -> None:
+        """From what was read to observed joints, in the order of ``JOINT_NAMES``, and link poses."""
         order = self._scenes[0].joint_order
         self._arrays["qpos"][:] = self._qpos[:, order]
         self._arrays["qvel"][:] = self._qvel[:, order]

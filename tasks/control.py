@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
@@ -31,12 +32,13 @@ class DriveTargets:
     Args:
         mode: ``pd_joint_delta_pos`` or ``pd_joint_pos``.
         backend: numpy or torch.
+        step_limit: (28,) how far each target may be ahead of its joint (m or rad).
 
     Raises:
         InvalidInputError: unknown mode.
     """
 
-    def __init__(self, mode: str, backend: Backend) -> None:
+    def __init__(self, mode: str, backend: Backend, step_limit: NDArray[np.float64] = DELTA_STEP) -> None:
         if mode not in CONTROL_MODES:
             raise InvalidInputError(f"control_mode {mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
         self.mode = mode
@@ -45,7 +47,7 @@ class DriveTargets:
         self._low, self._high = backend.array(limits[:, 0]), backend.array(limits[:, 1])
         self._half_range = backend.array((limits[:, 1] - limits[:, 0]) / 2)
         self._middle_range = backend.array((limits[:, 1] + limits[:, 0]) / 2)
-        self._delta = backend.array(DELTA_STEP.astype(np.float32))
+        self._delta = backend.array(step_limit.astype(np.float32))
         self._coupled = backend.array(MIDDLE), backend.array(END)  # on the device: no copy per step
 
     def __call__(self, action: Array, qpos: Array) -> Array:

@@ -14,27 +14,31 @@ import sapien
 from numpy.typing import NDArray
 from sapien import physx
 
-from tslam_bench.constants import PHYSICS_FREQUENCY, SUBSTEPS
 from tslam_bench.hand_constants import (
     ARMATURE,
     BASE_POSITION,
     BASE_QUATERNION,
     DAMPING,
-    FORCE_LIMIT,
     JOINT_NAMES,
     SKIN_LINKS,
     STIFFNESS,
 )
 from tslam_bench.tasks import link_poses, physics
+from tslam_bench.tasks.physics import PhysicsSettings
 from tslam_bench.tasks.starts import Start
 
 _NO_SELF_COLLISION: Final = 1 << 29  # shapes that share an ignore bit do not collide
 
 
 class BodyPool:
-    """Cooked objects of one process, lent to its scenes: cooking is dear, moving a body between systems is cheap."""
+    """Cooked objects of one process, lent to its scenes: cooking is dear, moving a body between systems is cheap.
 
-    def __init__(self) -> None:
+    Args:
+        settings: the physics that the bodies are made for.
+    """
+
+    def __init__(self, settings: PhysicsSettings = physics.PROTOCOL) -> None:
+        self.settings = settings
         self._free: dict[str, list[sapien.Entity]] = {}
         self._count = 0
 
@@ -43,7 +47,7 @@ class BodyPool:
         waiting = self._free.get(start.prepared.name)
         if waiting:
             return waiting.pop()
-        physics.configure()
+        physics.configure(self.settings)
         shapes = physics.collision_shapes(start.prepared)
         self._count += 1
         return physics.object_entity(start.prepared, start.prepared.name, shapes, can_render=False)
@@ -64,12 +68,13 @@ class HandScene:
 
     Args:
         urdf: the converted hand.
-        bodies: where object bodies come from.
+        bodies: where object bodies come from, and the settings of the physics.
         table: whether the object stands on a table.
     """
 
     def __init__(self, urdf: Path, bodies: BodyPool, table: bool = False) -> None:
-        physics.configure()
+        self.settings = bodies.settings
+        physics.configure(self.settings)
         self._table = physics.table_entity("table", can_render=False) if table else None
         self._bodies = bodies
         self._body: sapien.Entity | None = None
@@ -80,9 +85,10 @@ class HandScene:
         self.joint_order = np.array([joints[name] for name in JOINT_NAMES])
         self._from_order = np.argsort(self.joint_order)
         ordered = [self._robot.active_joints[index] for index in self.joint_order]
+        force_limit = self.settings.force_limit
         for index, joint in enumerate(ordered):
             joint.set_drive_properties(
-                float(STIFFNESS[index]), float(DAMPING[index]), float(FORCE_LIMIT[index]), "force"
+                float(STIFFNESS[index]), float(DAMPING[index]), float(force_limit[index]), "force"
             )
             joint.set_friction(0.0)
             joint.set_armature(np.array([ARMATURE[index]], dtype=np.float32))
@@ -98,9 +104,9 @@ class HandScene:
         if self._body is not None:
             self._bodies.give_back(self._body)
         self._body = self._bodies.borrow(start)
-        physics.configure()
+        physics.configure(self.settings)
         self._system = physx.PhysxCpuSystem()
-        self._system.timestep = 1.0 / PHYSICS_FREQUENCY
+        self._system.timestep = self.settings.timestep
         self._scene = sapien.Scene([self._system])
         for entity in self._entities:
             self._scene.add_entity(entity)
@@ -122,9 +128,13 @@ class HandScene:
             setter(target)
 
     def step(self) -> None:
-        """One control step: four physics steps."""
-        for _ in range(SUBSTEPS):
-            self._system.step()
+        """One control step."""
+        for _ in range(self.settings.substeps):
+            self.substep()
+
+    def substep(self) -> None:
+        """One physics step."""
+        self._system.step()
 
     def read(self, qpos: NDArray, qvel: NDArray, poses: NDArray) -> None:
         """Writes (28,) positions and velocities in the simulator's order (``joint_order``), and (M, 7) packed poses."""

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import sapien
+from numpy.typing import NDArray
 from sapien import physx
 
 from tslam_bench import grids
 from tslam_bench.assets.store import PreparedObject
-from tslam_bench.constants import TABLE_SIZE
-from tslam_bench.errors import AssetError
+from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS, TABLE_SIZE
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT
 
-SOLVER_POSITION_ITERATIONS: Final = 4
+SOLVER_POSITION_ITERATIONS: Final = 8
 SOLVER_VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET: Final = 2e-3
+PERSISTENT_CONTACTS: Final = False
+"""PhysX's persistent contact manifolds lose contacts of moving fingers with thin walls (``docs/fidelity.md``)."""
 REST_OFFSET: Final = 0.0
 GRAVITY: Final = (0.0, 0.0, -9.81)
 """The hand is gravity-compensated and the object fixed, so this moves nothing yet."""
@@ -30,20 +35,75 @@ COOKING_SCALE: Final = 100.0
 
 CACHED_BODIES: Final = 64
 """Cooked objects kept per process: cooking one takes up to a few dozen milliseconds."""
+_ARM_TRANSLATIONS: Final = slice(0, 3)
 
 
-def configure() -> None:
+@dataclass(frozen=True)
+class PhysicsSettings:
+    """What the physics can be tuned by; the defaults are the protocol's, and ``docs/fidelity.md`` says how they were chosen.
+
+    Attributes:
+        substeps: physics steps per control step, whose duration does not change.
+        position_iterations: of the TGS solver.
+        arm_step: how far a translation's target may be ahead of its joint (m per control step), in both control modes.
+        arm_force: largest force of a translation's drive (N).
+        contact_offset: distance (m) from which contacts are made.
+        persistent_contacts: whether contact manifolds are kept from step to step (PCM) or made anew.
+
+    Raises:
+        InvalidInputError: a number that is not above 0.
+    """
+
+    substeps: int = SUBSTEPS
+    position_iterations: int = SOLVER_POSITION_ITERATIONS
+    arm_step: float = float(DELTA_STEP[0])
+    arm_force: float = float(FORCE_LIMIT[0])
+    contact_offset: float = CONTACT_OFFSET
+    persistent_contacts: bool = PERSISTENT_CONTACTS
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name != "persistent_contacts" and not value > 0:
+                raise InvalidInputError(f"{name} {value!r}: must be above 0")
+
+    @property
+    def timestep(self) -> float:
+        """Duration of a physics step (s)."""
+        return CONTROL_STEP_SECONDS / self.substeps
+
+    @property
+    def step_limit(self) -> NDArray[np.float64]:
+        """(28,) how far each joint's target may be ahead of the joint (m or rad)."""
+        return _with_arm(DELTA_STEP, self.arm_step)
+
+    @property
+    def force_limit(self) -> NDArray[np.float64]:
+        """(28,) largest drive force of each joint (N or N m)."""
+        return _with_arm(FORCE_LIMIT, self.arm_force)
+
+
+def _with_arm(values: NDArray[np.float64], arm: float) -> NDArray[np.float64]:
+    changed = values.copy()
+    changed[_ARM_TRANSLATIONS] = arm
+    return changed
+
+
+PROTOCOL: Final = PhysicsSettings()
+"""The protocol's settings."""
+
+
+def configure(settings: PhysicsSettings = PROTOCOL) -> None:
     """Sets SAPIEN's global defaults for scenes, bodies and shapes that are made next: what ManiSkill sets for the task."""
-    physx.set_shape_config(contact_offset=CONTACT_OFFSET, rest_offset=REST_OFFSET)
+    physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=REST_OFFSET)
     physx.set_body_config(
-        solver_position_iterations=SOLVER_POSITION_ITERATIONS,
+        solver_position_iterations=settings.position_iterations,
         solver_velocity_iterations=SOLVER_VELOCITY_ITERATIONS,
         sleep_threshold=SLEEP_THRESHOLD,
     )
     physx.set_scene_config(
         gravity=np.array(GRAVITY),
         bounce_threshold=BOUNCE_THRESHOLD,
-        enable_pcm=True,
+        enable_pcm=settings.persistent_contacts,
         enable_tgs=True,
         enable_ccd=False,
         enable_enhanced_determinism=False,

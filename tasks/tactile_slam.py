@@ -26,9 +26,7 @@ from tslam_bench.constants import (
     GRID_SIZE,
     HORIZON,
     NUM_JOINTS,
-    PHYSICS_FREQUENCY,
     REWARD_MODES,
-    SUBSTEPS,
 )
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import (
@@ -160,18 +158,19 @@ class TactileSLAMEnv(BaseEnv):
     @property
     def _default_sim_config(self) -> SimConfig:
         return SimConfig(
-            # Whole numbers with the right ratio; the true timestep, 1 / PHYSICS_FREQUENCY, is set in _setup_scene.
-            sim_freq=SUBSTEPS * (PHYSICS_FREQUENCY // SUBSTEPS),
-            control_freq=PHYSICS_FREQUENCY // SUBSTEPS,
+            # Whole numbers with the right ratio; the true time step is set in _setup_scene.
+            sim_freq=physics.PROTOCOL.substeps * round(1 / CONTROL_STEP_SECONDS),
+            control_freq=round(1 / CONTROL_STEP_SECONDS),
             scene_config=SceneConfig(
                 gravity=np.array(physics.GRAVITY),
                 bounce_threshold=physics.BOUNCE_THRESHOLD,
                 sleep_threshold=physics.SLEEP_THRESHOLD,
-                contact_offset=physics.CONTACT_OFFSET,
+                contact_offset=physics.PROTOCOL.contact_offset,
                 rest_offset=physics.REST_OFFSET,
-                solver_position_iterations=physics.SOLVER_POSITION_ITERATIONS,
+                solver_position_iterations=physics.PROTOCOL.position_iterations,
                 solver_velocity_iterations=physics.SOLVER_VELOCITY_ITERATIONS,
                 enable_tgs=True,
+                enable_pcm=physics.PROTOCOL.persistent_contacts,
             ),
             default_materials_config=DefaultMaterialsConfig(
                 physics.STATIC_FRICTION, physics.DYNAMIC_FRICTION, physics.RESTITUTION
@@ -196,7 +195,7 @@ class TactileSLAMEnv(BaseEnv):
     @property
     def sim_timestep(self) -> float:
         """Physics timestep (s)."""
-        return 1.0 / PHYSICS_FREQUENCY
+        return physics.PROTOCOL.timestep
 
     @property
     def control_timestep(self) -> float:

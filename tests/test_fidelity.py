@@ -43,11 +43,11 @@ def test_wall_watch_sees_a_finger_that_passes_a_wall():
     union = HullUnion(prepared_box((0.2, 0.003, 0.2)))
 
     def carry(heights) -> WallCounts:
-        watch, counts = AxisWatch(union, 0), WallCounts()
+        watch, counts = AxisWatch(union, [0]), WallCounts()
         for height in heights:
             links = np.tile(np.eye(3, 4), (len(SKIN_LINKS), 1, 1))
             links[:, 1, 3] = height
-            watch.count(links, counts)
+            watch.count(links[None, None], counts)
         return counts
 
     slow = carry(np.arange(0.2, -0.2, -1e-3))

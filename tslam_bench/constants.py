@@ -37,12 +37,10 @@ TABLE_SIZE: Final = (0.30, 0.30, 0.05)
 forearm (50 mm thick) can hang in front of its edge while the fingers reach down to it."""
 
 # --- Section 4: time -------------------------------------------------------------------------------------------
-PHYSICS_FREQUENCY: Final = 133
-"""Physics steps per second."""
-SUBSTEPS: Final = 4
-"""Physics steps per control step (30.1 ms)."""
-CONTROL_STEP_SECONDS: Final = SUBSTEPS / PHYSICS_FREQUENCY
-"""Duration of a control step (s)."""
+CONTROL_STEP_SECONDS: Final = 4 / 133
+"""Duration of a control step (s): 30.1 ms."""
+SUBSTEPS: Final = 3
+"""Physics steps per control step (10.0 ms each)."""
 HORIZON: Final = 200
 """Control steps per episode (6.0 s)."""
 

@@ -67,7 +67,7 @@ FORCE_LIMIT: Final = _per_joint(60.0, 5.0, 5.0, 1.0)
 """(28,) largest drive force, N or N m."""
 ARMATURE: Final = _per_joint(0.001, 0.001, 0.005, 0.001)
 """(28,) rotor inertia of the model, kg or kg m^2."""
-DELTA_STEP: Final = _per_joint(0.04, 0.2, 0.25, 0.4)
+DELTA_STEP: Final = _per_joint(0.02, 0.2, 0.25, 0.4)
 """(28,) change of the target, relative to the current position, at action 1 in ``pd_joint_delta_pos`` (m or rad)."""
 
 CONTROL_MODES: Final = ("pd_joint_delta_pos", "pd_joint_pos")

@@ -70,28 +70,28 @@ class GraspConfig:
     """
 
     side: float = 0.05
-    forward: float = 0.06
-    forward_centre: float = -0.01
-    roll: float = 0.6
-    spread: float = 0.3
+    forward: float = 0.02
+    forward_centre: float = -0.016
+    roll: float = 0.57
+    spread: float = 0.38
     wrist: float = 0.1
-    depth: tuple[float, float] = (-0.08, 0.0)
-    rise: float = 0.03
+    depth: tuple[float, float] = (-0.08, -0.012)
+    rise: float = 0.016
     travel_height: float = 0.17
     travel_steps: int = 8
     sink_steps: int = 16
-    close_steps: int = 6
-    open_steps: int = 4
-    squeezes: int = 1
-    shift: float = 0.04
-    roll_shift: float = 0.4
-    press: float = 0.01
+    close_steps: int = 7
+    open_steps: int = 5
+    squeezes: int = 2
+    shift: float = 0.076
+    roll_shift: float = 0.6
+    press: float = 0.032
     knuckle: float = 1.5
     middle: float = 1.3
-    curl: float = 0.8
-    thumb: float = 0.3
+    curl: float = 1.0
+    thumb: float = 0.62
     opened: float = 0.1
-    stall: float = 3e-3
+    stall: float = 1.6e-3
     spots: int = 40
 
 

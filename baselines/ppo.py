@@ -198,7 +198,7 @@ class PPO:
                 result = self.environments.step(action.cpu().numpy() if is_numpy else action)
                 self._observation, reward, terminated, truncated, info = result
             end = self._tensor(terminated).bool() | self._tensor(truncated).bool()
-            reward = self._tensor(reward).float()
+            reward = self._tensor(reward).float().clone()  # the environments' memory may be written again
             count = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
             kept.append((action, drawn_with, value, reward, end, torch.stack(count, dim=1)))
             self.steps += self.config.action_repeat * self.environments.num_envs

@@ -1,8 +1,9 @@
 """Compares the touch definition (signed distance at skin probes) with PhysX's own contacts, on the CPU (protocol section 5).
 
-A link touches for PhysX when one of its contacts with the object has a separation below 0.5 mm after the control step's last
-substep. The rollouts press: random targets drawn for ten steps at a time, with a pull towards the object, so that there
-are contacts to compare.
+A link touches for PhysX when one of its contacts with the object has a separation below 0.5 mm. PhysX lists the contacts of the
+poses that a physics step starts from, so the skin is asked at those poses: after the last but one substep of a control step.
+The rollouts press: random targets drawn for ten steps at a time, with a pull towards the object, so that there are contacts to
+compare.
 
     python benchmarks/touch_audit.py --episodes 4
 """
@@ -10,17 +11,21 @@ are contacts to compare.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
-import torch
 import tyro
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from rollouts import Hands, PressingHands, run_episode
 
-import tslam_bench  # noqa: F401  (registers the environment)
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.assets.hand import load_hand
+from tslam_bench.constants import NUM_JOINTS, NUM_POSES, QUICK_OBJECTS
 from tslam_bench.hand_constants import SKIN_LINKS
+from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
+from tslam_bench.tasks.skin import build_skin
 
 PHYSX_TOUCH_SEPARATION = 0.5e-3
 """A PhysX contact closer than this (m) is a touch."""
@@ -56,55 +61,64 @@ class Audit:
         return self.both / max(1, self.both + self.oracle_only)
 
 
-def pressing_action(generator: np.random.Generator, held: np.ndarray, step: int, qpos: np.ndarray) -> np.ndarray:
-    """(28,) action of a hand that presses on what lies at the workspace centre; ``held`` is redrawn every ten steps."""
-    if step % 10 == 0:
-        held[:] = generator.uniform(-1, 1, NUM_JOINTS)
-        held[1] = generator.uniform(-1, 0.3)  # mostly downwards
-    action = held.copy()
-    action[[0, 2]] = np.clip(-10 * qpos[[0, 2]] + 0.5 * held[[0, 2]], -1, 1)
-    return action.astype(np.float32)
+class LastSubstep:
+    """Takes the place of a scene's ``step``: keeps the poses that the last substep starts from.
 
+    Args:
+        scene: a ``HandScene``.
+    """
 
-def physx_touch(environment: gym.Env) -> np.ndarray:
-    """(L,) bool, skin links that PhysX reports closer to the object than ``PHYSX_TOUCH_SEPARATION``."""
-    index = {name: row for row, name in enumerate(SKIN_LINKS)}
-    touch = np.zeros(len(SKIN_LINKS), dtype=bool)
-    for contact in environment.unwrapped.scene.px.get_contacts():
-        names = [body.entity.name for body in contact.bodies]
-        for name in names:
-            if name in index and min(point.separation for point in contact.points) < PHYSX_TOUCH_SEPARATION:
-                touch[index[name]] = True
-    return touch
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+        self._rows = scene.skin_rows()
+        self._joints = np.zeros((2, NUM_JOINTS), dtype=np.float32)
+        self._poses = np.zeros((1, scene.num_bodies, POSE_SIZE), dtype=np.float32)
+        self.links = np.zeros((1, len(SKIN_LINKS), 3, 4), dtype=np.float32)
+
+    def __call__(self) -> None:
+        """One control step."""
+        for _ in range(self._scene.settings.substeps - 1):
+            self._scene.substep()
+        self._scene.read(*self._joints, self._poses[0])
+        link_matrices(self._poses, self._rows, self.links)
+        self._scene.substep()
+
+    def physx(self) -> tuple[NDArray[np.bool_], list[float]]:
+        """(L,) skin links that PhysX saw closer to the object than ``PHYSX_TOUCH_SEPARATION``, and all separations (m)."""
+        index = {name: row for row, name in enumerate(SKIN_LINKS)}
+        touch, separations = np.zeros(len(SKIN_LINKS), dtype=bool), []
+        for contact in self._scene.contacts():
+            nearest = min(point.separation for point in contact.points)
+            separations.append(nearest)
+            for body in contact.bodies:
+                if body.entity.name in index and nearest < PHYSX_TOUCH_SEPARATION:
+                    touch[index[body.entity.name]] = True
+        return touch, separations
 
 
 def audit(name: str, episodes: int) -> Audit:
     """Rolls out ``episodes`` pressing episodes on one object."""
-    environment = gym.make(ENVIRONMENT_ID, object=name)
-    base = environment.unwrapped
-    both = probes_only = oracle_only = 0
-    depths = []
+    hands = Hands(1, BatchSettings(object=name, reward_mode="none"))
+    last = LastSubstep(hands.scenes[0])
+    hands.scenes[0].step = last
+    sensing, link_of_probe = hands.batch._sensing, build_skin(load_hand().shapes).probes.link
+    counts, depths = np.zeros(3, dtype=np.int64), []
+
+    def look(_: int) -> None:
+        truth, separations = last.physx()
+        felt = np.zeros(len(SKIN_LINKS), dtype=bool)
+        felt[link_of_probe[sensing.touches(last.links)[0]]] = True
+        counts[:] += ((felt & truth).sum(), (felt & ~truth).sum(), (truth & ~felt).sum())
+        if separations and min(separations) < PHYSX_TOUCH_SEPARATION:
+            depths.append(max(0.0, -min(separations)))
+
     for episode in range(episodes):
-        generator = np.random.Generator(np.random.PCG64(episode))
-        observation, _ = environment.reset(seed=episode, options={"pose": episode % NUM_POSES})
-        held = np.zeros(NUM_JOINTS)
-        for step in range(HORIZON):
-            action = pressing_action(generator, held, step, observation["qpos"][0].numpy())
-            observation, *_ = environment.step(action)
-            felt, truth = observation["touch"][0].numpy().astype(bool), physx_touch(environment)
-            both += int((felt & truth).sum())
-            probes_only += int((felt & ~truth).sum())
-            oracle_only += int((truth & ~felt).sum())
-            separations = [point.separation for contact in base.scene.px.get_contacts() for point in contact.points]
-            if separations and min(separations) < PHYSX_TOUCH_SEPARATION:
-                depths.append(max(0.0, -min(separations)))
-    environment.close()
-    return Audit(both, probes_only, oracle_only, np.array(depths))
+        run_episode(hands, episode, PressingHands(1, episode), look, poses=[episode % NUM_POSES])
+    return Audit(*(int(count) for count in counts), np.array(depths))
 
 
 def main(config: Config) -> None:
     """Prints one row per object."""
-    torch.set_num_threads(1)
     table = Table("object", "link touches", "precision", "recall", "depth p95 (mm)", "worst (mm)")
     for name in config.objects:
         result = audit(name, config.episodes)

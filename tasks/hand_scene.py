@@ -136,6 +136,10 @@ class HandScene:
         """One physics step."""
         self._system.step()
 
+    def contacts(self) -> Sequence[Any]:
+        """PhysX's contacts of the poses that the last physics step started from."""
+        return self._system.get_contacts()
+
     def read(self, qpos: NDArray, qvel: NDArray, poses: NDArray) -> None:
         """Writes (28,) positions and velocities in the simulator's order (``joint_order``), and (M, 7) packed poses."""
         qpos[:] = self._robot.qpos

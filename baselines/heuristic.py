@@ -69,28 +69,28 @@ class GraspConfig:
         spots: drawn per episode; more than fit in it.
     """
 
-    side: float = 0.05
+    side: float = 0.047
     forward: float = 0.02
-    forward_centre: float = -0.016
-    roll: float = 0.57
+    forward_centre: float = -0.008
+    roll: float = 0.22
     spread: float = 0.38
     wrist: float = 0.1
-    depth: tuple[float, float] = (-0.08, -0.012)
-    rise: float = 0.016
+    depth: tuple[float, float] = (-0.08, 0.028)
+    rise: float = 5e-3
     travel_height: float = 0.17
-    travel_steps: int = 8
-    sink_steps: int = 16
+    travel_steps: int = 13
+    sink_steps: int = 24
     close_steps: int = 7
     open_steps: int = 5
     squeezes: int = 2
     shift: float = 0.076
     roll_shift: float = 0.6
-    press: float = 0.032
-    knuckle: float = 1.5
-    middle: float = 1.3
+    press: float = 0.03
+    knuckle: float = 1.57
+    middle: float = 1.27
     curl: float = 1.0
-    thumb: float = 0.62
-    opened: float = 0.1
+    thumb: float = 0.45
+    opened: float = 0.06
     stall: float = 1.6e-3
     spots: int = 40
 

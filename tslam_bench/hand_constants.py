@@ -63,7 +63,7 @@ STIFFNESS: Final = _per_joint(2000.0, 50.0, 10.0, 1.0)
 """(28,) drive stiffness, N/m or N m/rad."""
 DAMPING: Final = _per_joint(200.0, 5.0, 0.8, 0.08)
 """(28,) drive damping, N s/m or N m s/rad."""
-FORCE_LIMIT: Final = _per_joint(60.0, 5.0, 5.0, 1.0)
+FORCE_LIMIT: Final = _per_joint(30.0, 5.0, 5.0, 1.0)
 """(28,) largest drive force, N or N m."""
 ARMATURE: Final = _per_joint(0.001, 0.001, 0.005, 0.001)
 """(28,) rotor inertia of the model, kg or kg m^2."""

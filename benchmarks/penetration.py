@@ -25,7 +25,7 @@ from rollouts import KINDS, TEN_OBJECTS, Hands, make_actor, run_episode
 from separation import SeparationRuler
 from touch_audit import Audit
 
-from tslam_bench.constants import NUM_POSES
+from tslam_bench.constants import NUM_POSES, SUBSTEPS
 from tslam_bench.tasks.batch import BatchSettings
 
 CONTACT_SEPARATION = 0.5e-3
@@ -98,12 +98,12 @@ def measure(config: Config, settings: MujocoSettings | None) -> dict[str, float]
 
 def main(config: Config) -> None:
     """Prints one row per engine and setting."""
-    tried: list[tuple[str, MujocoSettings | None]] = [("engine (PhysX, 4 substeps)", None)]
-    tried.append(("MuJoCo, its own softness, 4 substeps", MujocoSettings()))
+    tried: list[tuple[str, MujocoSettings | None]] = [(f"engine (PhysX, {SUBSTEPS} substeps)", None)]
+    tried.append((f"MuJoCo, its own softness, {SUBSTEPS} substeps", MujocoSettings()))
     tried.append(("MuJoCo, its own softness, 15 substeps", MujocoSettings(substeps=15)))
     for substeps in config.substeps:
         tried.append((f"MuJoCo, stiff, {substeps} substeps", replace(STIFF, substeps=substeps)))
-    tried.append(("MuJoCo, stiff and speculative, 4 substeps", replace(STIFF, speculative=True)))
+    tried.append((f"MuJoCo, stiff and speculative, {SUBSTEPS} substeps", replace(STIFF, speculative=True)))
     header = ("engine", "contact steps", "median (mm)", "p95 (mm)", "p99 (mm)", "max (mm)")
     rows: list[tuple[str, ...]] = []
     result: list[dict[str, Any]] = []

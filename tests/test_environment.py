@@ -33,7 +33,8 @@ from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
 from tslam_bench.tasks.rendering import vulkan_device_available
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-from touch_audit import audit
+from penetration import pressing_audits
+from rollouts import TEN_OBJECTS
 
 
 def pressing_actions(seed: int, steps: int = HORIZON) -> np.ndarray:
@@ -93,11 +94,14 @@ def test_touched_voxels_lie_on_the_true_surface(environment):
     assert not (base.touched & ~base.visited)[0].all(), "the hand has been where it touched"
 
 
-def test_touch_agrees_with_physx_contacts():
-    result = audit("mug", episodes=2)
-    assert result.both > 200
-    assert result.precision >= 0.8 and result.recall >= 0.8
-    assert np.percentile(result.depths, 95) < 1e-3, "a pressing hand penetrates less than 1 mm at the 95th percentile"
+def test_touch_agrees_with_an_independent_ruler():
+    """MuJoCo's distances, which were checked against exact ones; PhysX's own are off by a millimetre (docs/fidelity.md)."""
+    results = list(pressing_audits(TEN_OBJECTS, 2).values())
+    both, skin, ruler = (sum(getattr(r, name) for r in results) for name in ("both", "probes_only", "oracle_only"))
+    assert both > 1000
+    assert both / (both + skin) >= 0.8 and both / (both + ruler) >= 0.8
+    depths = np.concatenate([r.depths for r in results])
+    assert np.percentile(depths, 95) < 1e-3, "pressing hands penetrate less than 1 mm at the 95th percentile"
 
 
 def test_flat_observations():

@@ -21,17 +21,17 @@ from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, Contacts
 
 Array = Any
 
-COVERAGE_WEIGHT: Final = 0.0025
-"""Lambda of ``r = r_d + lambda r_c``: makes the two terms' episode sums equal within a factor 2 under a random policy."""
+COVERAGE_WEIGHT: Final = 0.005
+"""Lambda of ``r = r_d + lambda r_c``: makes the two terms' episode sums equal within a factor 2 under a random policy (docs/rewards.md)."""
 MODE_SCALE: Final = {
     "tslam": 1.0,
     "no_coverage": 1.0,
     "no_discovery": 1.0,
-    "points": 0.5,
-    "contact": 1.0,
-    "knn": 0.7,
-    "disagreement": 1200.0,
-    "chamfer": 50.0,
+    "points": 0.4,
+    "contact": 0.7,
+    "knn": 0.75,
+    "disagreement": 2300.0,
+    "chamfer": 80.0,
 }
 """Factor on the term that replaces ``r_d``: brings its episode sum under a random policy to the order of ``r_d``'s."""
 NEIGHBOURS: Final = 5

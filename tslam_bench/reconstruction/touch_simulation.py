@@ -26,12 +26,12 @@ class TouchSimulation:
 
     approaches: tuple[int, int] = (1, 8)
     """Directions the hand comes from: the poses that were explored."""
-    touched_voxels: tuple[int, int] = (2, 130)
+    touched_voxels: tuple[int, int] = (2, 300)
     """Touched voxels aimed at per approach, log-uniform over examples; never less than four in all."""
-    sweeps: tuple[int, int] = (1, 10)
+    sweeps: tuple[int, int] = (1, 20)
     """Balls of free space that the hand sweeps per approach. Examples with many sweeps tend to have many touches."""
     sweep_radius: tuple[float, float] = (0.035, 0.09)
-    close_sweeps: float = 0.6
+    close_sweeps: float = 0.8
     """Share of approaches whose sweeps pass right beside the object; the others keep a voxel away from it."""
     finger_radius: float = 0.0075
     finger_length: float = 0.06
@@ -64,7 +64,7 @@ class SimulatedTouches:
     swept_voxels: NDArray[np.bool_]
 
 
-_MAX_GRASPS = 150
+_MAX_GRASPS = 300
 _MAX_LOCAL = 2000  # surface samples looked at per grasp; they come in random order
 _STEP = 0.007  # between samples along a finger (m), below the voxel edge
 

@@ -22,7 +22,8 @@ from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, Contacts
 Array = Any
 
 COVERAGE_WEIGHT: Final = 0.005
-"""Lambda of ``r = r_d + lambda r_c``: makes the two terms' episode sums equal within a factor 2 under a random policy (docs/rewards.md)."""
+"""Lambda of ``r = r_d + lambda r_c``: makes the two terms' episode sums equal within a factor 2
+under a random policy (docs/rewards.md)."""
 MODE_SCALE: Final = {
     "tslam": 1.0,
     "no_coverage": 1.0,

@@ -47,8 +47,6 @@ DEPTH_LIMIT: Final = 1.0
 """95th percentile of penetration of pressing hands (mm) that a setting has to stay below."""
 GIVE_UP: Final = 3
 """Incidents of random hands within the screen after which a setting is given up."""
-ARRIVAL_STEPS: Final = 133
-"""Control steps (4 s) that drives have for reaching a target."""
 TODAY: Final = PhysicsSettings(4, 4, 0.04, 60.0, 2e-3, persistent_contacts=True)
 """What the settings are compared with: the first version of the benchmark."""
 
@@ -149,7 +147,7 @@ def walls(physics: PhysicsSettings, kind: str, objects: Sequence[str], steps: in
 
 def arrival(physics: PhysicsSettings) -> dict[str, float]:
     """95th percentile of the distance from a target after 4 s, per group of joints (m or rad)."""
-    errors = tracking_errors(5, 8, physics, ARRIVAL_STEPS)
+    errors = tracking_errors(5, 8, physics)
     return {group: float(np.percentile(errors[:, joints], 95)) for group, joints in JOINT_GROUPS.items()}
 
 

@@ -84,7 +84,11 @@ def test_the_default_sets_keep_what_the_protocol_promises(split, least, least_ca
         assert len(record["products_sha256"]) == 64
         assert 0.032 <= max(record["extents_m"]) <= 0.25  # 0.8 of the smallest draw
     generated = {source.name: source for source in generate.candidates(split, rounds=200)}
-    stated = objects | manifest["rejected"]
+    # A record of an older format is of an object that was not rebuilt since: it says so, and docs/objects.md counts them.
+    current = {name: record for name, record in objects.items() if record["format"] == store.FORMAT}
+    assert all(record["format"] in (1, store.FORMAT) for record in objects.values())
+    assert split == "train" or len(current) == len(objects)
+    stated = current | manifest["rejected"]
     # The manifest speaks of the code as it is: another generator, setting or gate asks for a new one.
     assert {name: stated[name]["parameters_sha256"] for name in stated if name in generated} == {
         name: parameters_sha256(generated[name]) for name in stated if name in generated

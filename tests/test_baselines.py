@@ -307,7 +307,8 @@ def test_heuristic_closes_where_it_meets_an_obstacle_and_comes_back() -> None:
 def test_heuristic_stops_at_its_depth_when_nothing_is_there() -> None:
     config = GraspConfig()
     heights, flexions = phases_of(-1.0, [0, 1, 2, 3])
-    assert heights.min() > config.depth[0] - 0.01
+    assert heights.min() > config.depth[0] - config.press - 0.01  # the closing hand presses on
+    assert heights.min() < config.depth[1]
     assert (flexions.max(axis=0) > 1.0).all()
 
 

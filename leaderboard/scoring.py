@@ -58,6 +58,10 @@ PLAUSIBLE_SLACK: Final = 2e-3
 """A touched voxel holds a contact point, which lies on the collision hulls; this much (m) is allowed for the error of
 the field and for the linear step from probe to surface."""
 
+EXPECTED_IMPLAUSIBLE: Final = 0.02
+"""A share of implausible touches up to this is not remarked on: where a finger presses several millimetres into the union of hulls,
+the field's gradient is no longer the way out. Of 450 honest sets of eight poses, eight had any, at most 0.8 %."""
+
 SHAPE_METRICS: Final = {
     "iou": 0.0,
     "iou_raw": 0.0,
@@ -446,7 +450,7 @@ def _notes(
         for count, reason in result.reasons.items():
             if reason is not None and reason != "missing":
                 empty.setdefault(reason, []).append(f"{where}, {count} poses")
-        if result.implausible_touches > 0:
+        if result.implausible_touches > EXPECTED_IMPLAUSIBLE:
             share = f"{100 * result.implausible_touches:.1f} %"
             notes.append(f"{where}: {share} of the touched voxels are too far from the object to hold a contact")
     for reason, places in empty.items():

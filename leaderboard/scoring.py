@@ -59,8 +59,8 @@ PLAUSIBLE_SLACK: Final = 2e-3
 the field and for the linear step from probe to surface."""
 
 EXPECTED_IMPLAUSIBLE: Final = 0.02
-"""A share of implausible touches up to this is not remarked on: where a finger presses several millimetres into the union of hulls,
-the field's gradient is no longer the way out. Of 450 honest sets of eight poses, eight had any, at most 0.8 %."""
+"""A share of implausible touches up to this is not remarked on: where a finger presses several millimetres into the union of
+hulls, the field's gradient is no longer the way out. Of 450 honest sets of eight poses, eight had any, at most 0.8 %."""
 
 SHAPE_METRICS: Final = {
     "iou": 0.0,

@@ -36,4 +36,5 @@ step bash tests/typecheck.sh
 step "$PYTHON" -m tslam_bench.cli assets prepare --quick
 step "$PYTHON" -m tslam_bench.cli assets prepare --objects cubemedium cubesmall  # of the fidelity tests
 step "$PYTHON" docs/build_environment.py --check
+step "$PYTHON" docs/build_results.py --check
 step "$PYTHON" -m pytest "${markers[@]}" "$@"

@@ -18,7 +18,7 @@ from tslam_bench import grids
 from tslam_bench.assets import store
 from tslam_bench.assets.contactdb import OBJECTS
 from tslam_bench.assets.store import load_object, prepared_names
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, TRAIN_OBJECTS, VOXEL_EDGE
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, QUICK_TRAIN_OBJECTS, TRAIN_OBJECTS, VOXEL_EDGE
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
     COUPLING_END,
@@ -29,12 +29,12 @@ from tslam_bench.hand_constants import (
     SKIN_LINKS,
 )
 from tslam_bench.tasks.arrays import NumpyBackend
+from tslam_bench.tasks.batch import BatchSettings
 from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
 from tslam_bench.tasks.rendering import vulkan_device_available
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from penetration import pressing_audits
-from rollouts import TEN_OBJECTS
 
 
 def pressing_actions(seed: int, steps: int = HORIZON) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_touched_voxels_lie_on_the_true_surface(environment):
 
 def test_touch_agrees_with_an_independent_ruler():
     """MuJoCo's distances, which were checked against exact ones; PhysX's own are off by a millimetre (docs/fidelity.md)."""
-    results = list(pressing_audits(TEN_OBJECTS, 2).values())
+    results = list(pressing_audits(QUICK_TRAIN_OBJECTS, 1, BatchSettings(split="train")).values())
     both, skin, ruler = (sum(getattr(r, name) for r in results) for name in ("both", "probes_only", "oracle_only"))
     assert both > 1000
     assert both / (both + skin) >= 0.8 and both / (both + ruler) >= 0.8

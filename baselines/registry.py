@@ -99,7 +99,7 @@ def make_baseline(identifier: str, model: Path | None = None, deterministic: boo
 
         return RandomBaseline()
     if identifier == "random_targets":
-        from tslam_bench.baselines.random_targets import RandomTargetsBaseline
+        from tslam_bench.baselines.random_actions import RandomTargetsBaseline
 
         return RandomTargetsBaseline()
     from tslam_bench.baselines.heuristic import HeuristicBaseline

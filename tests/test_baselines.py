@@ -18,8 +18,7 @@ from tslam_bench.baselines.interface import Baseline, episode_generators
 from tslam_bench.baselines.learned import LearnedBaseline
 from tslam_bench.baselines.model_files import make_network, read_model, write_model
 from tslam_bench.baselines.network import NETWORKS, PolicyNetwork
-from tslam_bench.baselines.random_actions import RandomBaseline
-from tslam_bench.baselines.random_targets import RandomTargetsBaseline
+from tslam_bench.baselines.random_actions import RandomBaseline, RandomTargetsBaseline
 from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
 from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES

@@ -53,7 +53,8 @@ def brier_score(probability: NDArray, true: NDArray[np.bool_], weights: NDArray[
         true: (M,) bool.
         weights: (M,) volume that each point stands for.
     """
-    return float(weights @ np.square(np.asarray(probability, dtype=np.float64) - true) / weights.sum())
+    squared = np.square(np.asarray(probability, dtype=np.float64) - true)
+    return float((weights * squared).sum() / weights.sum())  # not `@`: its last bits depend on the number of threads
 
 
 def calibration_error(

@@ -13,9 +13,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from tslam_bench.baselines.registry import get_baseline, list_baselines
-from tslam_bench.baselines.training_config import TrainingConfig
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import get_baseline, list_baselines
+
+from .training_config import TrainingConfig
 
 _USAGE = """usage: tslam-bench baselines COMMAND ...
 
@@ -113,7 +114,7 @@ def _list(arguments: list[str]) -> None:
 def _train(arguments: list[str]) -> None:
     from tqdm import tqdm
 
-    from tslam_bench.baselines.training import train
+    from .training import train
 
     parsed = tyro.cli(TrainArguments, args=arguments, prog="tslam-bench baselines train")
     config: TrainingConfig = parsed.config
@@ -139,7 +140,7 @@ def _evaluate(arguments: list[str]) -> None:
     spec = get_baseline(parsed.baseline)
     import torch
 
-    from tslam_bench.baselines.evaluate import EvaluationConfig, default_objects, evaluate, make_reconstructors
+    from tslam_bench.evaluation.evaluate import EvaluationConfig, default_objects, evaluate, make_reconstructors
 
     if parsed.torch_threads < 1:
         raise InvalidInputError(f"torch_threads {parsed.torch_threads}: must be at least 1")

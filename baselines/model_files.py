@@ -14,10 +14,11 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from tslam_bench.baselines.network import NETWORKS, PolicyNetwork
-from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE
 from tslam_bench.files import atomic_file, write_json
+
+from .network import NETWORKS, PolicyNetwork
 
 
 def make_network(name: str, initial_std: float = 0.6, seed: int | None = None) -> PolicyNetwork:

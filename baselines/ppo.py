@@ -23,8 +23,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from tslam_bench.baselines.network import Encoded, PolicyNetwork
-from tslam_bench.baselines.training_config import TrainingConfig
+from .network import Encoded, PolicyNetwork
+from .training_config import TrainingConfig
 
 STAGES: Final = ("simulate", "encode", "infer", "learn")
 """Where an iteration's time goes; ``encode`` is copying observations into the rollout buffer's form."""

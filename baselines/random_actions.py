@@ -13,8 +13,8 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.baselines.interface import check_observation, episode_generators
 from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.evaluation.policy import check_observation, episode_generators
 from tslam_bench.hand_constants import CONTROL_MODES
 
 DEVIATION: Final = 0.6
@@ -37,12 +37,12 @@ class _DrawnBaseline(ABC):
         """One horizon's actions in [-1, 1] of one episode."""
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
-        """See :class:`tslam_bench.baselines.interface.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
         self._generators = episode_generators(num_envs, seed)
         self._draw()
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
-        """See :class:`tslam_bench.baselines.interface.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
         check_observation(observation, len(self._generators))
         if self._step == HORIZON:
             self._draw()

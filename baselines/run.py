@@ -1,7 +1,7 @@
 """The whole benchmark as one run: assets, training, episodes, reconstruction, scores, page.
 
 ``baselines/run_all.sh`` sets up the environment and calls this. Each stage is a ``tslam-bench`` command that can be typed by
-hand; this module only plans them and hands them to :class:`tslam_bench.baselines.jobs.JobRunner`.
+hand; this module only plans them and hands them to :class:`tslam_bench.evaluation.jobs.JobRunner`.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from typing import Final, Literal
 import tyro
 from tqdm import tqdm
 
-from tslam_bench.assets.store import asset_sha256, known_names, list_objects
-from tslam_bench.baselines.jobs import Job, JobRunner
-from tslam_bench.baselines.registry import get_baseline, list_baselines
-from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS
 from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
 from tslam_bench.episodes import check_salt
 from tslam_bench.errors import BenchmarkError, InvalidInputError
-from tslam_bench.leaderboard.submission import INFO_FILE
+from tslam_bench.evaluation.jobs import Job, JobRunner
+from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline, list_baselines
+from tslam_bench.objects.store import asset_sha256, known_names, list_objects
 from tslam_bench.reconstruction.registry import get_reconstructor
+from tslam_bench.scoring.submission import INFO_FILE
+
+from .training_config import PAPER_STEPS
 
 _ONE_PROCESS: Final = ("--processes", "1")
 """Jobs run side by side, so each simulates in one process."""

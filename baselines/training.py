@@ -24,15 +24,16 @@ from gymnasium.vector import VectorEnv
 from torch.utils.tensorboard import SummaryWriter
 
 import tslam_bench
-from tslam_bench.assets.store import asset_sha256, list_objects
-from tslam_bench.baselines.model_files import make_network, write_model
-from tslam_bench.baselines.ppo import PPO
-from tslam_bench.baselines.registry import get_baseline
-from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS, TrainingConfig
 from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
-from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
+from tslam_bench.objects.store import asset_sha256, list_objects
+
+from .model_files import make_network, write_model
+from .ppo import PPO
+from .training_config import PAPER_STEPS, TrainingConfig
 
 CHECKPOINT_STATE: Final = "state.json"
 CHECKPOINT_TENSORS: Final = "state.pt"

@@ -8,18 +8,14 @@ from typing import Annotated, Final, Literal, get_args
 
 import tyro
 
-from tslam_bench.baselines.registry import get_baseline
 from tslam_bench.constants import HORIZON
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import get_baseline
 
 PAPER_STEPS: Final = 10_000_000
 """Training budget of the paper, in environment steps."""
 
 
-MODEL_FILE: Final = "model.safetensors"
-"""A finished model's weights: numbers alone, so that a stranger's model cannot run code."""
-METADATA_FILE: Final = "model.json"
-"""Written last: a model directory without it is unfinished."""
 NetworkName = Literal["fast", "paper"]
 ControlMode = Literal["pd_joint_pos", "pd_joint_delta_pos"]
 

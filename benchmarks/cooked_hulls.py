@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import ConvexHull
 
-from tslam_bench.assets.store import PreparedObject, check_split, load_object, prepared_names
-from tslam_bench.tasks.physics import collision_shapes
+from tslam_bench.engine.physics import collision_shapes
+from tslam_bench.objects.store import PreparedObject, check_split, load_object, prepared_names
 
 
 @dataclass(frozen=True)

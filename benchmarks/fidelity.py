@@ -25,13 +25,13 @@ from touch_audit import audit
 from tqdm import tqdm
 from tunnelling import WallCounts, crossings
 
-from tslam_bench.assets.hand import load_hand
 from tslam_bench.constants import CONTROL_STEP_SECONDS, HORIZON, NUM_JOINTS, QUICK_OBJECTS
+from tslam_bench.engine.arrays import NumpyBackend
+from tslam_bench.engine.control import DriveTargets
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.physics import PROTOCOL, PhysicsSettings
 from tslam_bench.hand_constants import DAMPING, DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, STIFFNESS, WRIST_JOINTS
-from tslam_bench.tasks.arrays import NumpyBackend
-from tslam_bench.tasks.batch import BatchSettings
-from tslam_bench.tasks.control import DriveTargets
-from tslam_bench.tasks.physics import PROTOCOL, PhysicsSettings
+from tslam_bench.objects.hand import load_hand
 
 JOINT_GROUPS: Final = {
     "arm (m)": slice(0, 3),

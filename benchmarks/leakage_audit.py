@@ -18,11 +18,12 @@ import tyro
 from report import machine, print_table, write_json
 from tqdm import tqdm
 
-from tslam_bench.assets import leakage, store
-from tslam_bench.assets.fetch import fetch
-from tslam_bench.assets.meshes import TriangleMesh
-from tslam_bench.assets.sources import CONTACTDB_WHEEL
 from tslam_bench.files import cache_directory
+from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.objects import store
+from tslam_bench.preparation import leakage
+from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
 BINS = (0.0, 0.15, 0.20, 0.25, 0.30, 0.40)
 """Bounds of the descriptor distances; the first bin is the shortlist itself."""

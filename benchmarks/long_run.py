@@ -29,9 +29,9 @@ from report import machine, write_json
 from tqdm import tqdm
 
 import tslam_bench
-from tslam_bench.assets.store import list_objects
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import BenchmarkError
+from tslam_bench.objects.store import list_objects
 
 SAMPLES: Final = 20
 """Memory samples over a run."""
@@ -144,7 +144,7 @@ def _proportional_set_size(pid: int) -> int:
 
 def random_rollout(envs: Any, config: Config, watch: Watch, memory: Memory) -> float:
     """Random actions for ``config.steps``; returns seconds of wall time."""
-    from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
+    from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 
     generator = np.random.Generator(np.random.PCG64(config.seed))
     rounds = -(-config.steps // config.num_envs)

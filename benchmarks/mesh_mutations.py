@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from tslam_bench.assets.meshes import TriangleMesh
+from tslam_bench.geometry.meshes import TriangleMesh
 
 Generator = np.random.Generator
 

@@ -1,6 +1,6 @@
 """The benchmark's hand and objects in MuJoCo: a peer to measure the CPU engine against, not part of the product.
 
-:class:`MujocoScene` has the methods of ``tslam_bench.tasks.hand_scene.HandScene``, so the rest of the engine (worker processes,
+:class:`MujocoScene` has the methods of ``tslam_bench.engine.hand_scene.HandScene``, so the rest of the engine (worker processes,
 shared memory, drive targets, sensing, rewards, episode starts) runs unchanged on top of it: what differs is the physics.
 The hand is the same URDF, its drives are position actuators with the same gains and force limits, the object is a mocap body of
 the same convex hulls. Needs ``mujoco``.
@@ -20,8 +20,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS
+from tslam_bench.engine import hand_batch, physics, worker_vector_env
+from tslam_bench.engine.starts import Start
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
     ARMATURE,
@@ -33,8 +34,7 @@ from tslam_bench.hand_constants import (
     SKIN_LINKS,
     STIFFNESS,
 )
-from tslam_bench.tasks import batch, physics, vector_env
-from tslam_bench.tasks.starts import Start
+from tslam_bench.objects.store import PreparedObject
 
 _HAND, _OBJECT = 1, 2  # contact bits: the hand collides with the object only
 
@@ -183,7 +183,7 @@ def _soften(geom: Any, settings: MujocoSettings) -> None:
 
 
 def _scenes(settings: MujocoSettings) -> Any:
-    """What takes the place of ``HandScene`` in ``tslam_bench.tasks.batch``: makes scenes that share one pool."""
+    """What takes the place of ``HandScene`` in ``tslam_bench.engine.hand_batch``: makes scenes that share one pool."""
     pools: dict[Path, MujocoPool] = {}
 
     def make(urdf: Path, _bodies: Any, table: bool = False) -> MujocoScene:
@@ -197,11 +197,11 @@ def _scenes(settings: MujocoSettings) -> Any:
 @contextmanager
 def mujoco_batches(settings: MujocoSettings) -> Iterator[None]:
     """Every ``HandBatch`` made inside simulates with MuJoCo."""
-    with mock.patch.object(batch, "HandScene", _scenes(settings)):
+    with mock.patch.object(hand_batch, "HandScene", _scenes(settings)):
         yield
 
 
-_ENGINE_WORK: Final = vector_env._work
+_ENGINE_WORK: Final = worker_vector_env._work
 
 
 def _work(settings: MujocoSettings, *arguments: Any) -> None:
@@ -211,10 +211,10 @@ def _work(settings: MujocoSettings, *arguments: Any) -> None:
 
 def make_mujoco_vec(
     num_envs: int,
-    settings: batch.BatchSettings,
+    settings: hand_batch.BatchSettings,
     processes: int | None = None,
     mujoco_settings: MujocoSettings | None = None,
-) -> vector_env.TactileVectorEnv:
+) -> worker_vector_env.TactileVectorEnv:
     """``TactileVectorEnv`` whose workers simulate with MuJoCo; everything else is the engine's own code."""
-    with mock.patch.object(vector_env, "_work", partial(_work, mujoco_settings or MujocoSettings())):
-        return vector_env.TactileVectorEnv(num_envs, settings, processes)
+    with mock.patch.object(worker_vector_env, "_work", partial(_work, mujoco_settings or MujocoSettings())):
+        return worker_vector_env.TactileVectorEnv(num_envs, settings, processes)

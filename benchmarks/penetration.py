@@ -26,7 +26,7 @@ from separation import SeparationRuler
 from touch_audit import Audit
 
 from tslam_bench.constants import NUM_POSES, SUBSTEPS
-from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.engine.hand_batch import BatchSettings
 
 CONTACT_SEPARATION = 0.5e-3
 """A hand closer to the object than this (m) is in contact."""

@@ -28,14 +28,14 @@ from stages import stage_costs
 from tqdm import tqdm
 from tunnelling import WallCounts, crossings
 
-from tslam_bench.assets.store import load_object
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.constants import HORIZON, NUM_POSES
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.physics import PhysicsSettings
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import DELTA_STEP
-from tslam_bench.leaderboard.metrics import TouchCoverage
-from tslam_bench.tasks.batch import BatchSettings
-from tslam_bench.tasks.physics import PhysicsSettings
+from tslam_bench.objects.store import load_object
+from tslam_bench.scoring.metrics import TouchCoverage
 
 TRAIN_OBJECTS: Final = (
     *("mug-000", "bowl-000", "goblet-000", "frying-pan-000", "mallet-000", "teapot-000", "plate-000"),

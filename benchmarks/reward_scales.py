@@ -17,10 +17,10 @@ from report import machine, markdown_table, print_table, replace_section, write_
 from tqdm import tqdm
 
 import tslam_bench
-from tslam_bench.baselines.registry import make_baseline
-from tslam_bench.baselines.rollout import roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_POSES, QUICK_TRAIN_OBJECTS, REWARD_MODES
-from tslam_bench.tasks.rewards import COVERAGE_WEIGHT, MODE_SCALE
+from tslam_bench.engine.rewards import COVERAGE_WEIGHT, MODE_SCALE
+from tslam_bench.evaluation.policies import make_baseline
+from tslam_bench.evaluation.rollouts import roll_out_batch
 
 SALT = "0"
 POLICIES = ("random_targets", "random")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import HORIZON, NUM_JOINTS
-from tslam_bench.tasks.batch import BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
 
 TEN_OBJECTS: Final = (
     *("mug", "stanfordbunny", "toruslarge", "wineglass", "hammer"),

@@ -24,14 +24,15 @@ from numpy.typing import NDArray
 from report import machine, markdown_table
 from scipy.ndimage import gaussian_filter
 
-from tslam_bench import __version__, grids
-from tslam_bench.assets.store import PreparedObject, load_object
+from tslam_bench import grids
 from tslam_bench.errors import BenchmarkError
-from tslam_bench.leaderboard import metrics, prediction, scoring
-from tslam_bench.leaderboard.info import SubmissionInfo
-from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, Submission, SubmissionWriter, read_submission
+from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring import metrics, prediction, scoring
+from tslam_bench.scoring.info import SubmissionInfo
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, Submission, SubmissionWriter, read_submission
+from tslam_bench.version import __version__
 
 KINDS = ("hull", "grid", "blurred")
 """Reconstructors."""

@@ -10,10 +10,10 @@ import numpy as np
 from mujoco_peer import MujocoSettings, build_model
 from numpy.typing import NDArray
 
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import load_object
+from tslam_bench.engine import physics
 from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
-from tslam_bench.tasks import physics
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import load_object
 
 REACH = 2e-3
 """Shapes further apart than this (m) are not measured."""

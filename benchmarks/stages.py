@@ -9,7 +9,7 @@ import numpy as np
 from rollouts import Hands, exploring_actions
 
 from tslam_bench.constants import HORIZON
-from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.engine.hand_batch import BatchSettings
 
 STAGES = ("drive targets", "physics", "reading state", "sensing", "rewards", "resets", "rest")
 """Stages of a control step; ``rest`` is what the others leave: control law, writing observations, the loop itself."""

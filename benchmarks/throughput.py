@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, REWARD_MODES
-from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.engine.hand_batch import BatchSettings
 
 MUJOCO_USUAL = MujocoSettings(substeps=15)
 """MuJoCo at its usual time step of 2 ms, with its own contact softness."""

@@ -20,12 +20,12 @@ from rich.console import Console
 from rich.table import Table
 from rollouts import Hands, PressingHands, run_episode
 
-from tslam_bench.assets.hand import load_hand
 from tslam_bench.constants import NUM_JOINTS, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices
+from tslam_bench.engine.skin import build_skin
 from tslam_bench.hand_constants import SKIN_LINKS
-from tslam_bench.tasks.batch import BatchSettings
-from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
-from tslam_bench.tasks.skin import build_skin
+from tslam_bench.objects.hand import load_hand
 
 PHYSX_TOUCH_SEPARATION = 0.5e-3
 """A PhysX contact closer than this (m) is a touch."""

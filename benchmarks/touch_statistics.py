@@ -22,13 +22,13 @@ from tqdm import tqdm
 
 import tslam_bench
 from tslam_bench import grids
-from tslam_bench.assets.store import PreparedObject, load_object
-from tslam_bench.baselines.registry import make_baseline
-from tslam_bench.baselines.rollout import roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, QUICK_TRAIN_OBJECTS
-from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES
+from tslam_bench.evaluation.policies import make_baseline
+from tslam_bench.evaluation.rollouts import roll_out_batch
+from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
 from tslam_bench.reconstruction.training_shapes import PlacedShape, training_shape
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 
 SALT: Final = "0"
 BANDS: Final = ((1, 1), (2, 2), (3, 3), (4, 5), (6, 9), (10, 99))

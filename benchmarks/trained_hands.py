@@ -21,10 +21,10 @@ from report import machine, markdown_table, print_table, replace_section
 from rollouts import Hands, run_episode
 from separation import SeparationRuler
 
-from tslam_bench.baselines.interface import Baseline
-from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.constants import NUM_POSES
-from tslam_bench.tasks.batch import OBSERVATION_ARRAYS, BatchSettings
+from tslam_bench.engine.hand_batch import OBSERVATION_ARRAYS, BatchSettings
+from tslam_bench.evaluation.policies import make_baseline
+from tslam_bench.evaluation.policy import Baseline
 
 TWELVE_OBJECTS = (
     *("mug-000", "bowl-000", "goblet-000", "frying-pan-000", "mallet-000", "teapot-000", "plate-000", "spoon-000"),

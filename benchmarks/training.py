@@ -30,13 +30,13 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
-from tslam_bench.assets.store import list_objects
 from tslam_bench.baselines.network import VELOCITY_SCALE, ConvolutionTrunk
 from tslam_bench.baselines.ppo import STAGES
+from tslam_bench.baselines.sb3_adapter import TactileVecEnv
 from tslam_bench.baselines.training import CURVE_FILE, make_training_environments, train
 from tslam_bench.baselines.training_config import TrainingConfig
-from tslam_bench.baselines.vector import TactileVecEnv
 from tslam_bench.hand_constants import JOINT_LIMITS
+from tslam_bench.objects.store import list_objects
 
 _COLUMNS = ("simulate", "copy", "infer", "learn", "rest")
 """Stages; ``copy`` brings observations into the rollout buffer, ``rest`` is logging and what nobody timed."""

@@ -23,10 +23,10 @@ from gymnasium.vector import VectorEnv
 from report import print_table
 
 import tslam_bench
-from tslam_bench.assets.store import prepared_names
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
-from tslam_bench.baselines.rollout import roll_out_batch
 from tslam_bench.constants import ENVIRONMENT_ID, QUICK_TRAIN_OBJECTS
+from tslam_bench.evaluation.rollouts import roll_out_batch
+from tslam_bench.objects.store import prepared_names
 
 SALT: Final = "0"
 RANGES: Final[dict[str, tuple[float, float]]] = {

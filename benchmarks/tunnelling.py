@@ -24,13 +24,13 @@ from rollouts import KINDS, Hands, make_actor
 from scipy.spatial import ConvexHull
 
 from tslam_bench import grids
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import PreparedObject, load_object
 from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices
+from tslam_bench.engine.skin import build_skin
 from tslam_bench.hand_constants import SKIN_LINKS
-from tslam_bench.tasks.batch import BatchSettings
-from tslam_bench.tasks.link_poses import POSE_SIZE, link_matrices
-from tslam_bench.tasks.skin import build_skin
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import PreparedObject, load_object
 
 QUIET_STEPS = 20
 """Physics steps without anything to count that part two incidents of one hand."""

@@ -17,10 +17,10 @@ import gymnasium
 import tyro
 
 import tslam_bench  # noqa: F401  (registers the environment)
+from tslam_bench.cli.environments import action_rows, environment_rows, observation_rows, reward_rows
 from tslam_bench.constants import ENVIRONMENT_ID, TABLETOP_ID
 from tslam_bench.files import atomic_file
 from tslam_bench.hand_constants import SKIN_LINKS
-from tslam_bench.tasks.commands import action_rows, environment_rows, observation_rows, reward_rows
 
 TARGET = Path(__file__).parent / "environment.md"
 

@@ -33,7 +33,7 @@ class Config:
 def rows() -> list[str]:
     """One row per marked line: file, function, the line. A marked docstring stands for its whole function."""
     found = []
-    for path in sorted([*ROOT.glob("tasks/*.py"), *ROOT.glob("tslam_bench/*.py"), *ROOT.glob("baselines/*.py")]):
+    for path in sorted([*ROOT.glob("tasks/*.py"), *ROOT.glob("tslam_bench/**/*.py"), *ROOT.glob("baselines/*.py")]):
         text = path.read_text(encoding="utf-8")
         functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
         for number, line in enumerate(text.splitlines(), start=1):

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from tslam_bench.assets import generate
-from tslam_bench.assets.meshes import TriangleMesh
 from tslam_bench.files import atomic_file
+from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.sources.generator import generate
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import fuzz_importer

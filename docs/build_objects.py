@@ -19,10 +19,12 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from tslam_bench.assets import contactdb, furniture, generate, household, store
-from tslam_bench.assets.decompose import EXCEPTIONS, STANDARD, settings_for
-from tslam_bench.assets.pipeline import HULL_IOU_EXCEPTIONS
 from tslam_bench.files import atomic_file
+from tslam_bench.objects import splits, store
+from tslam_bench.preparation.decompose import EXCEPTIONS, STANDARD, settings_for
+from tslam_bench.preparation.pipeline import HULL_IOU_EXCEPTIONS
+from tslam_bench.sources import contactdb, sweethome3d
+from tslam_bench.sources.generator import generate, household
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "objects.md"
@@ -97,7 +99,7 @@ def objects_table(manifests: Manifests) -> str:
 
 def excluded_table(manifests: Manifests) -> str:
     """Names of the paper's list that the split leaves out."""
-    return table(["name", "why"], [[f"`{name}`", why] for name, why in contactdb.EXCLUDED.items()])
+    return table(["name", "why"], [[f"`{name}`", why] for name, why in splits.EXCLUDED.items()])
 
 
 def filled_table(manifests: Manifests) -> str:
@@ -171,7 +173,7 @@ def license_table(manifests: Manifests) -> str:
     rows = [["test", contactdb.SOURCE, contactdb.LICENSE, "", len(manifests["test"]["objects"])]]
     for split in ("train", "val"):
         records = manifests[split]["objects"]
-        for name, text in furniture.LICENSES.items():
+        for name, text in sweethome3d.LICENSES.items():
             of_catalogue = [r for r in records if f": {name}: " in r["source"]]
             creators = {r["details"]["creator"] for r in of_catalogue}
             rows.append(
@@ -326,7 +328,7 @@ def _one_of_each(split: str) -> list[str]:
 
 def draw_sheets() -> None:
     """Contact sheets of the prepared objects of each split, and of the generator."""
-    from tslam_bench.assets.pictures import contact_sheet
+    from tslam_bench.preparation.sheets import contact_sheet
 
     PICTURES.mkdir(exist_ok=True)
     chosen = {split: store.prepared_names(split) for split in store.SPLITS}

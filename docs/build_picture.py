@@ -20,13 +20,13 @@ from tqdm import tqdm
 
 import tslam_bench  # noqa: F401  (registers the environment)
 from tslam_bench import grids
-from tslam_bench.assets.hand import load_hand, visual_meshes
-from tslam_bench.assets.store import load_object
-from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_POSES
 from tslam_bench.episodes import episode_seed
+from tslam_bench.evaluation.policies import make_baseline
 from tslam_bench.files import atomic_file
-from tslam_bench.leaderboard.render import Camera, render, voxels_to_mesh
+from tslam_bench.geometry.render import Camera, render, voxels_to_mesh
+from tslam_bench.objects.hand import load_hand, visual_meshes
+from tslam_bench.objects.store import load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 
 HAND, OBJECT, TOUCHED, REBUILT = (0.72, 0.74, 0.78), (0.93, 0.62, 0.28), (0.20, 0.55, 0.85), (0.35, 0.70, 0.50)

@@ -18,7 +18,6 @@ import tyro
 from numpy.typing import NDArray
 
 from tslam_bench import grids
-from tslam_bench.assets.store import PreparedObject, load_object, prepared_names
 from tslam_bench.constants import (
     GRID_SIZE,
     OCCUPANCY_THRESHOLD,
@@ -28,14 +27,15 @@ from tslam_bench.constants import (
     WORKSPACE_LOW,
 )
 from tslam_bench.errors import BenchmarkError
-from tslam_bench.leaderboard.metrics import iou
+from tslam_bench.geometry.sampling import iou_points
+from tslam_bench.objects.store import PreparedObject, load_object, prepared_names
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
 from tslam_bench.reconstruction.training_shapes import PlacedShape, training_shape
 from tslam_bench.reconstruction.volume import Reconstructor
-from tslam_bench.sampling import iou_points
+from tslam_bench.scoring.metrics import iou
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,17 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from tslam_bench.assets.store import asset_sha256
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
-from tslam_bench.leaderboard.aggregate import Estimate
-from tslam_bench.leaderboard.page import build_page
-from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
-from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
-from tslam_bench.leaderboard.submission import INFO_FILE, RECONSTRUCTED_POSES, Submission, read_submission
+from tslam_bench.objects.store import asset_sha256
+from tslam_bench.scoring.aggregate import Estimate
+from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.submission import INFO_FILE, RECONSTRUCTED_POSES, Submission, read_submission
+
+from .page import build_page
+from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
+from .ranking import rank
 
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from importlib.resources import files
+from pathlib import Path
 from string import Template
 from typing import Any, Final
 
@@ -21,9 +21,12 @@ from tslam_bench.constants import (
     SURFACE_SAMPLES,
     VOXEL_EDGE,
 )
-from tslam_bench.leaderboard.charts import Axis, Line, line_chart
-from tslam_bench.leaderboard.pictures import TOUCHED_AS_THEY_ARE
-from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
+
+from .charts import Axis, Line, line_chart
+from .pictures import TOUCHED_AS_THEY_ARE
+
+_TEMPLATES = Path(__file__).parent / "templates"
 
 Images = Mapping[tuple[str, str, str], bytes]
 """(kind, content hash, object) -> WebP; the hash is empty for the true mesh."""
@@ -111,9 +114,9 @@ def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
                 links.append((identifier + suffix, title))
     links += [("protocol", "How to read this"), ("reproduce", "Reproduce")]
     navigation = "".join(f'<a href="#{identifier}">{escape(title)}</a>' for identifier, title in links)
-    page = Template(files("tslam_bench.leaderboard").joinpath("page.html").read_text(encoding="utf-8"))
+    page = Template((_TEMPLATES / "page.html").read_text(encoding="utf-8"))
     return page.substitute(
-        style=files("tslam_bench.leaderboard").joinpath("page.css").read_text(encoding="utf-8").strip(),
+        style=(_TEMPLATES / "page.css").read_text(encoding="utf-8").strip(),
         hero=_hero(tables, images),
         navigation=navigation,
         content="\n".join(content),

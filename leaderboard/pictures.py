@@ -20,14 +20,14 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from tslam_bench.assets.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.constants import GRID_SIZE, NUM_POSES, OCCUPANCY_THRESHOLD
 from tslam_bench.files import atomic_file
-from tslam_bench.leaderboard.prediction import invalid_mesh
-from tslam_bench.leaderboard.render import Camera, Colour, fit_camera, render, voxels_to_mesh
-from tslam_bench.leaderboard.scoring import merge_touched_steps
-from tslam_bench.leaderboard.submission import EXPLORATION_ORDER, Submission, read_submission
+from tslam_bench.geometry.render import Camera, Colour, fit_camera, render, voxels_to_mesh
+from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring.prediction import invalid_mesh
+from tslam_bench.scoring.scoring import merge_touched_steps
+from tslam_bench.scoring.submission import EXPLORATION_ORDER, Submission, read_submission
 
 PICTURE_SIZE: Final = 232
 """Pixels across a picture; its height depends on the object."""

@@ -14,11 +14,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from tslam_bench import __version__
 from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
-from tslam_bench.leaderboard.aggregate import interval, probability_of_improvement, resampled_means
-from tslam_bench.leaderboard.scoring import CURVE_SPACING, SubmissionScore, object_set
-from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES
+from tslam_bench.scoring.aggregate import interval, probability_of_improvement, resampled_means
+from tslam_bench.scoring.scoring import CURVE_SPACING, SubmissionScore, object_set
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
+from tslam_bench.version import __version__
 
 LEADERBOARD_VERSION: Final = 2
 """Version of the layout of leaderboard.json."""

@@ -19,8 +19,6 @@ from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, GPUMemoryConfig, SceneConfig, SimConfig
 from sapien import physx
 
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import PreparedObject
 from tslam_bench.constants import (
     CONTROL_STEP_SECONDS,
     GRID_SIZE,
@@ -28,23 +26,25 @@ from tslam_bench.constants import (
     NUM_JOINTS,
     REWARD_MODES,
 )
+from tslam_bench.engine import physics
+from tslam_bench.engine.arrays import Backend, NumpyBackend, TorchBackend
+from tslam_bench.engine.gpu_memory import gpu_memory
+from tslam_bench.engine.hand_agent import AdroitHand
+from tslam_bench.engine.rendering import vulkan_device_available
+from tslam_bench.engine.rewards import Rewards
+from tslam_bench.engine.sensing import Contacts, TactileSensing
+from tslam_bench.engine.sensing_numba import CompiledSensing
+from tslam_bench.engine.skin import build_skin
+from tslam_bench.engine.starts import StartSampler
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import (
     CONTROL_MODES,
     JOINT_NAMES,
     SKIN_LINKS,
 )
-from tslam_bench.tasks import physics
-from tslam_bench.tasks.arrays import Backend, NumpyBackend, TorchBackend
-from tslam_bench.tasks.compiled_sensing import CompiledSensing
-from tslam_bench.tasks.gpu_memory import gpu_memory
-from tslam_bench.tasks.hand_agent import AdroitHand
-from tslam_bench.tasks.rendering import vulkan_device_available
-from tslam_bench.tasks.rewards import Rewards
-from tslam_bench.tasks.sensing import Contacts, TactileSensing
-from tslam_bench.tasks.skin import build_skin
-from tslam_bench.tasks.starts import StartSampler
-from tslam_bench.variants import FREE, TABLETOP, Variant
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import PreparedObject
+from tslam_bench.variants import FREE, Variant
 
 MAX_GPU_ENVIRONMENTS: Final = 1 << 16
 """More sub-scenes than this on one GPU are a slip of the pen."""
@@ -479,27 +479,4 @@ class TactileSLAMEnv(BaseEnv):
         return self._sensing.touched_step
 
 
-class TactileSLAMTabletopEnv(TactileSLAMEnv):
-    """The same task with the object standing on a table: poses 0..3 only.
-
-    **Description.** As in ``TactileSLAM-v0``, but a table (``TABLE_SIZE``, its top at the object's lowest point) blocks the
-    hand from below. The object stays at the workspace centre and stays fixed. Where the table is, is known, so contact
-    with it is discounted: ``touch`` and the touched voxels are those of the object alone, as its signed distance says.
-    The table's top follows from the object's height, which no observation states; the hand finds it by being stopped.
-
-    **Actions, observations, rewards, starting state, episode end.** As in ``TactileSLAM-v0``.
-
-    Args:
-        pose: 0..3 for every episode; None draws one per episode. All other arguments as in ``TactileSLAM-v0``.
-
-    Raises:
-        InvalidInputError: a pose that is not 0..3, or what ``TactileSLAM-v0`` refuses.
-
-    **Version history.** v0: first version. Not part of the ranking: submissions are for ``TactileSLAM-v0``.
-    """
-
-    VARIANT = TABLETOP
-
-
 register(FREE.id, TactileSLAMEnv, max_episode_steps=HORIZON)
-register(TABLETOP.id, TactileSLAMTabletopEnv, max_episode_steps=HORIZON)

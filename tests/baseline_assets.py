@@ -9,9 +9,9 @@ import numpy as np
 import trimesh
 from objects import prepare_primitive
 
-from tslam_bench.assets import store
-from tslam_bench.assets.hand import hand_directory, load_hand
 from tslam_bench.constants import SURFACE_SAMPLES
+from tslam_bench.objects import store
+from tslam_bench.objects.hand import hand_directory, load_hand
 
 SHAPES = {
     "train": {"box": (0.10, 0.08, 0.06), "plate": (0.14, 0.10, 0.03)},

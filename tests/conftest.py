@@ -9,7 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: its threads wait 
 import pytest
 from objects import prepared_box, prepared_sphere, prepared_torus
 
-from tslam_bench.assets.store import PreparedObject
+from tslam_bench.objects.store import PreparedObject
 
 
 @pytest.fixture(scope="session")

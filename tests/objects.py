@@ -11,10 +11,10 @@ import igl
 import numpy as np
 import trimesh
 
-from tslam_bench.assets.store import PreparedObject, SignedDistanceField
 from tslam_bench.constants import GRID_SIZE, SURFACE_SAMPLES, VOXEL_EDGE
+from tslam_bench.geometry.sampling import iou_cells, iou_points
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.sampling import iou_cells, iou_points
+from tslam_bench.objects.store import PreparedObject, SignedDistanceField
 
 
 def inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:

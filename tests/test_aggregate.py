@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, norm, trim_mean
 
-from tslam_bench.leaderboard.aggregate import (
+from tslam_bench.scoring.aggregate import (
     Bootstrap,
     estimate_all,
     interquartile_mean,

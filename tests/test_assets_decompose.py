@@ -5,9 +5,9 @@ import pytest
 from manifold3d import Manifold
 from scipy.spatial import ConvexHull
 
-from tslam_bench.assets import decompose
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold, to_manifold
-from tslam_bench.assets.solids import circle, ring
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, to_manifold
+from tslam_bench.preparation import decompose
+from tslam_bench.sources.generator.solids import circle, ring
 
 QUICK = decompose.DecompositionSettings(iterations=20, input_triangles=800)
 

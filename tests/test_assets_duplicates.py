@@ -7,9 +7,11 @@ import pytest
 from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
-from tslam_bench.assets import duplicates, generate, prepare, store
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold
-from tslam_bench.assets.pipeline import SourceMesh
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
+from tslam_bench.objects import store
+from tslam_bench.preparation import copies, schedule
+from tslam_bench.preparation.pipeline import SourceMesh
+from tslam_bench.sources.generator import generate
 
 
 def turned(mesh: TriangleMesh, factor: float, seed: int | None = None) -> TriangleMesh:
@@ -26,7 +28,7 @@ def test_integrals_of_a_box_have_a_closed_form():
     radius = np.sqrt((edges**2).sum() / 12)
     deviations = np.sort(edges / np.sqrt(12)) / radius
     surface = 2 * (edges[0] * edges[1] + edges[0] * edges[2] + edges[1] * edges[2])
-    measures, axes = duplicates.measure(mesh)
+    measures, axes = copies.measure(mesh)
     np.testing.assert_allclose(measures, [edges.prod() / radius**3, surface / radius**2, *deviations], rtol=1e-9)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
 
@@ -35,22 +37,22 @@ def test_integrals_of_a_box_have_a_closed_form():
 def test_copies_align(name):
     """Thin, branching, symmetric and round shapes, whatever their pose, mirror image and scale."""
     mesh, _ = generate.draw(name, 0)
-    assert duplicates.aligned_overlap(turned(mesh, 0.6, seed=1), mesh) > duplicates.MAX_OVERLAP
+    assert copies.aligned_overlap(turned(mesh, 0.6, seed=1), mesh) > copies.MAX_OVERLAP
 
 
 def test_the_verdict_does_not_depend_on_the_order():
     """One search finds 0.966 from the first to the second and less the other way: asked again, the kept one was dropped."""
     first, second = generate.draw("trophy", 0)[0], generate.draw("trophy", 4)[0]
-    value = duplicates.aligned_overlap(first, second)
-    assert duplicates.aligned_overlap(second, first) == pytest.approx(value, abs=1e-9)
-    assert value > duplicates.MAX_OVERLAP
+    value = copies.aligned_overlap(first, second)
+    assert copies.aligned_overlap(second, first) == pytest.approx(value, abs=1e-9)
+    assert value > copies.MAX_OVERLAP
 
 
 @pytest.mark.parametrize("name", ["stool", "frying-pan", "carton"])
 def test_other_draws_of_a_category_are_no_copies(name):
     first, second = generate.draw(name, 0)[0], generate.draw(name, 1)[0]
-    differ = np.abs(np.log(duplicates.measure(first)[0] / duplicates.measure(second)[0])).max()
-    assert differ > duplicates.MAX_DIFFERENCE or duplicates.aligned_overlap(first, second) <= duplicates.MAX_OVERLAP
+    differ = np.abs(np.log(copies.measure(first)[0] / copies.measure(second)[0])).max()
+    assert differ > copies.MAX_DIFFERENCE or copies.aligned_overlap(first, second) <= copies.MAX_OVERLAP
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +84,9 @@ def test_copies_are_dropped_and_remembered(tmp_path):
         generate.GeneratedSource("train", *key) for key in [("book", 0), ("dumbbell", 0), ("carton", 1)]
     )
     copy, copy_in_val = TurnedSource("train", "book", 0.8), TurnedSource("val", "dumbbell", 0.9)
-    assert [o.status for o in prepare.prepare_distinct([copy_in_val], cache=tmp_path)] == ["prepared"]
+    assert [o.status for o in schedule.prepare_distinct([copy_in_val], cache=tmp_path)] == ["prepared"]
 
-    outcomes = list(prepare.prepare_distinct([book, copy, dumbbell, carton], count=3, cache=tmp_path))
+    outcomes = list(schedule.prepare_distinct([book, copy, dumbbell, carton], count=3, cache=tmp_path))
     final = {outcome.name: outcome for outcome in outcomes}
     assert {name: outcome.status for name, outcome in final.items()} == {
         "book-000": "prepared",
@@ -96,7 +98,7 @@ def test_copies_are_dropped_and_remembered(tmp_path):
     assert store.prepared_names("train", tmp_path) == ["book-000", "carton-001", "dumbbell-000"]
     assert store.prepared_names("val", tmp_path) == []
 
-    again = {o.name: o for o in prepare.prepare_distinct([copy, book], cache=tmp_path)}
+    again = {o.name: o for o in schedule.prepare_distinct([copy, book], cache=tmp_path)}
     assert again[copy.name].status == "rejected"
     assert again[copy.name].message == final[copy.name].message
-    assert [o.status for o in prepare.prepare_distinct([copy_in_val], cache=tmp_path)] == ["rejected"]
+    assert [o.status for o in schedule.prepare_distinct([copy_in_val], cache=tmp_path)] == ["rejected"]

@@ -6,9 +6,9 @@ import zipfile
 
 import pytest
 
-from tslam_bench.assets.fetch import fetch_wheel
 from tslam_bench.errors import AssetError
 from tslam_bench.files import sha256_file
+from tslam_bench.sources.fetch import fetch_wheel
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from tslam_bench.assets import decompose, field
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
+from tslam_bench.preparation import decompose, field
 
 HALF = np.array([0.03, 0.02, 0.01])
 

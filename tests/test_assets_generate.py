@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tslam_bench.assets import generate, household
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.sources.generator import generate, household
 
 
 @pytest.mark.parametrize("category", sorted(household.CATEGORIES))

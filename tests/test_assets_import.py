@@ -16,15 +16,18 @@ import pytest
 import trimesh
 
 import tslam_bench
-from tslam_bench.assets import commands, generate, meshfiles, store
-from tslam_bench.assets.hand import hand_directory, load_hand
-from tslam_bench.assets.importer import read_set, scan
-from tslam_bench.assets.meshfiles import read_mesh_file
-from tslam_bench.assets.prepare import remove_unlisted
-from tslam_bench.assets.scaling import LONGEST_EDGE, scale_to_hand
-from tslam_bench.assets.workers import WorkerPool
+from tslam_bench.cli import assets
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.objects import store
+from tslam_bench.objects.hand import hand_directory, load_hand
+from tslam_bench.preparation.schedule import remove_unlisted
+from tslam_bench.preparation.workers import WorkerPool
+from tslam_bench.sources import meshfiles
+from tslam_bench.sources.generator import generate
+from tslam_bench.sources.importer import read_set, scan
+from tslam_bench.sources.meshfiles import read_mesh_file
+from tslam_bench.sources.scaling import LONGEST_EDGE, scale_to_hand
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
@@ -327,7 +330,7 @@ def test_import_reports_and_goes_on(folder, tmp_path, monkeypatch, capsys):
     cache = tmp_path / "cache"
     monkeypatch.setenv("TSLAM_BENCH_CACHE", str(cache))
     arguments = ["import", str(folder), "--split", "mine", "--license", "CC0", "--source", "me", "--workers", "1"]
-    commands.main(arguments)
+    assets.main(arguments)
     report = json.loads((cache / "import-mine.json").read_text())
     assert report["counts"] == {"prepared": 2, "failed": 1}
     (broken,) = [entry for entry in report["files"] if entry["status"] == "failed"]
@@ -336,7 +339,7 @@ def test_import_reports_and_goes_on(folder, tmp_path, monkeypatch, capsys):
     loaded = store.load_object("kitchen-carton", "mine", cache)
     assert loaded.category == "kitchen"
     assert loaded.record["license"] == "CC0"
-    commands.main(arguments)  # resumes: nothing is done again
+    assets.main(arguments)  # resumes: nothing is done again
     assert json.loads((cache / "import-mine.json").read_text())["counts"] == {"reused": 2, "failed": 1}
     capsys.readouterr()
 
@@ -414,7 +417,7 @@ def test_a_private_set_from_files_to_touch(tmp_path, monkeypatch, capsys):
     hand_directory(cache).parent.mkdir(parents=True)
     hand_directory(cache).symlink_to(hand_directory(), target_is_directory=True)
     monkeypatch.setenv("TSLAM_BENCH_CACHE", str(cache))
-    commands.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
+    assets.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
     bracket = store.load_object("bracket", "mine")
     np.testing.assert_allclose(np.ptp(bracket.vertices, axis=0), EXTENTS / 2, atol=1e-6)
     assert volume_and_centroid(bracket_mesh)[0] == pytest.approx(bracket.record["volume_m3"], rel=1e-4)
@@ -439,9 +442,9 @@ def test_a_private_set_from_files_to_touch(tmp_path, monkeypatch, capsys):
 
     manifest.write_text(json.dumps({"split": "mine", "license": "ours", "source": "lab", "objects": entries[:1]}))
     capsys.readouterr()
-    commands.main(["prepare", "--manifest", str(manifest), "--objects", "carton", "--workers", "1"])
+    assets.main(["prepare", "--manifest", str(manifest), "--objects", "carton", "--workers", "1"])
     assert store.prepared_names("mine") == ["bracket", "carton"]  # a part of the manifest removes nothing
-    commands.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
+    assets.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
     assert store.prepared_names("mine") == ["carton"]
     assert "bracket: no longer in" in capsys.readouterr().out
 

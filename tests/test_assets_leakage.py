@@ -5,9 +5,10 @@ import pytest
 from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
-from tslam_bench.assets import generate, leakage
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold, simplify, to_manifold
 from tslam_bench.errors import AssetError
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, simplify, to_manifold
+from tslam_bench.preparation import leakage
+from tslam_bench.sources.generator import generate
 
 
 def copy_of(mesh: TriangleMesh, seed: int, mirror: bool, triangles: int = 2000) -> TriangleMesh:

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from tslam_bench.assets import generate, occupancy
-from tslam_bench.assets.distance import sample_surface
-from tslam_bench.assets.meshes import from_manifold, to_manifold
 from tslam_bench.constants import IOU_INSIDE_POINTS, VOXEL_EDGE
+from tslam_bench.geometry.distance import sample_surface
+from tslam_bench.geometry.meshes import from_manifold, to_manifold
+from tslam_bench.geometry.sampling import iou_cells, iou_points
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.sampling import iou_cells, iou_points
+from tslam_bench.preparation import occupancy
+from tslam_bench.sources.generator import generate
 
 
 @pytest.fixture(scope="module")

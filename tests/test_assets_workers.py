@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from tslam_bench.assets.workers import WorkerPool
+from tslam_bench.preparation.workers import WorkerPool
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_their_parent_in_the_middle_of_a_job(how):
     script = textwrap.dedent("""
         import time
-        from tslam_bench.assets.workers import WorkerPool
+        from tslam_bench.preparation.workers import WorkerPool
         if __name__ == "__main__":
             pool = WorkerPool(time.sleep, size=2, time_limit=600.0)
             for job in range(2):

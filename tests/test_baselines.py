@@ -14,15 +14,14 @@ import pytest
 import torch
 
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
-from tslam_bench.baselines.interface import Baseline, episode_generators
-from tslam_bench.baselines.learned import LearnedBaseline
+from tslam_bench.baselines.learned_policy import LearnedBaseline
 from tslam_bench.baselines.model_files import make_network, read_model, write_model
 from tslam_bench.baselines.network import NETWORKS, PolicyNetwork
 from tslam_bench.baselines.random_actions import RandomBaseline, RandomTargetsBaseline
-from tslam_bench.baselines.registry import get_baseline, list_baselines, make_baseline
-from tslam_bench.baselines.training_config import METADATA_FILE, MODEL_FILE
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, get_baseline, list_baselines, make_baseline
+from tslam_bench.evaluation.policy import Baseline, episode_generators
 from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH
 
 
@@ -194,7 +193,7 @@ def test_a_model_in_half_precision_acts_in_single(policy, tmp_path) -> None:
 
 def test_scripted_baselines_need_no_torch() -> None:
     code = (
-        "import sys; from tslam_bench.baselines.registry import make_baseline, list_baselines\n"
+        "import sys; from tslam_bench.evaluation.policies import make_baseline, list_baselines\n"
         "make_baseline('random'); make_baseline('heuristic'); list_baselines()\n"
         "assert not {'torch', 'sapien', 'stable_baselines3'} & set(sys.modules)"
     )

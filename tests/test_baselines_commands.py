@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tslam_bench import cli
-from tslam_bench.baselines.registry import list_baselines
+from tslam_bench.evaluation.policies import list_baselines
 
 ROOT = Path(__file__).parent.parent
 

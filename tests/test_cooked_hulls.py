@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from tslam_bench.assets.store import load_object
 from tslam_bench.constants import QUICK_OBJECTS
-from tslam_bench.tasks import physics
+from tslam_bench.engine import physics
+from tslam_bench.objects.store import load_object
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from cooked_hulls import cook

@@ -15,11 +15,13 @@ import torch
 
 import tslam_bench
 from tslam_bench import grids
-from tslam_bench.assets import store
-from tslam_bench.assets.contactdb import OBJECTS
-from tslam_bench.assets.store import load_object, prepared_names
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, QUICK_TRAIN_OBJECTS, TRAIN_OBJECTS, VOXEL_EDGE
+from tslam_bench.engine.arrays import NumpyBackend
+from tslam_bench.engine.control import END, MIDDLE, DriveTargets
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.rendering import vulkan_device_available
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import package_data
 from tslam_bench.hand_constants import (
     COUPLING_END,
     COUPLING_MIDDLE,
@@ -28,10 +30,8 @@ from tslam_bench.hand_constants import (
     JOINT_LIMITS,
     SKIN_LINKS,
 )
-from tslam_bench.tasks.arrays import NumpyBackend
-from tslam_bench.tasks.batch import BatchSettings
-from tslam_bench.tasks.control import END, MIDDLE, DriveTargets
-from tslam_bench.tasks.rendering import vulkan_device_available
+from tslam_bench.objects.splits import OBJECTS
+from tslam_bench.objects.store import load_object, prepared_names
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from penetration import pressing_audits
@@ -194,7 +194,7 @@ def test_a_default_environment_draws_from_train(recwarn):
 
 
 def test_the_default_set_has_as_many_objects_as_its_manifest():
-    manifest = json.loads((Path(store.__file__).parent / "manifest_train.json").read_text(encoding="utf-8"))
+    manifest = json.loads((package_data("assets", "manifest_train.json")).read_text(encoding="utf-8"))
     assert len(manifest["objects"]) == TRAIN_OBJECTS
 
 

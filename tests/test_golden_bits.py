@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import tslam_bench
-from tslam_bench.baselines.registry import make_baseline
+from tslam_bench.evaluation.policies import make_baseline
 
 FILE = Path(__file__).parent / "golden_bits.json"
 OBSERVED = ("qpos", "qvel", "touch", "occupancy", "time")

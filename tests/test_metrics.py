@@ -12,11 +12,11 @@ from objects import surface_grid
 from scipy.spatial.distance import cdist
 
 from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
+from tslam_bench.geometry.sampling import iou_cells, iou_points
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.leaderboard import metrics, prediction
-from tslam_bench.leaderboard.prediction import MESH_BOUND, prepare
 from tslam_bench.reconstruction.volume import Volume
-from tslam_bench.sampling import iou_cells, iou_points
+from tslam_bench.scoring import metrics, prediction
+from tslam_bench.scoring.prediction import MESH_BOUND, prepare
 
 
 def rng(seed: int = 0) -> np.random.Generator:

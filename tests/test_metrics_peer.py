@@ -14,12 +14,12 @@ import trimesh
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from tslam_bench.assets.store import PreparedObject, load_object
 from tslam_bench.constants import QUICK_OBJECTS, WORKSPACE_EDGE
-from tslam_bench.leaderboard.nearest import NearestSamples
-from tslam_bench.leaderboard.scoring import Truth, score_reconstruction
+from tslam_bench.geometry.nearest import NearestSamples
+from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring.scoring import Truth, score_reconstruction
 
 
 def winding(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:

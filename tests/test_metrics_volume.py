@@ -13,11 +13,11 @@ from scipy.ndimage import gaussian_filter
 
 from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.geometry import isosurface
 from tslam_bench.grids import points_to_grid, voxel_centres
-from tslam_bench.leaderboard.metrics import iou
-from tslam_bench.leaderboard.prediction import solid_in_mesh
-from tslam_bench.reconstruction import isosurface
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring.metrics import iou
+from tslam_bench.scoring.prediction import solid_in_mesh
 
 
 def tetrahedra_of_a_cell() -> np.ndarray:

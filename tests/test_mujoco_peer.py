@@ -11,10 +11,10 @@ from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, build_model, make_muj
 from rollouts import Hands, PressingHands, run_episode
 from separation import REACH, SeparationRuler
 
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import load_object
 from tslam_bench.constants import NUM_JOINTS
-from tslam_bench.tasks.batch import BatchSettings
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import load_object
 
 SETTINGS = BatchSettings(object="mug", pose=0, control_mode="pd_joint_pos")
 

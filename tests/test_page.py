@@ -16,21 +16,21 @@ import trimesh
 from objects import surface_grid
 
 from tslam_bench import __version__, grids
-from tslam_bench.assets import store
-from tslam_bench.assets.store import PreparedObject
 from tslam_bench.cli import main
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.leaderboard.aggregate import Estimate, interval, resampled_means
 from tslam_bench.leaderboard.charts import Axis, Line, line_chart
 from tslam_bench.leaderboard.commands import find_inputs, page_main, score_main
-from tslam_bench.leaderboard.info import SubmissionInfo, Training
 from tslam_bench.leaderboard.page import build_page, group_explorers
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
-from tslam_bench.leaderboard.submission import RECONSTRUCTED_POSES, SubmissionWriter
+from tslam_bench.objects import store
+from tslam_bench.objects.store import PreparedObject
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.volume import Reconstructor
+from tslam_bench.scoring.aggregate import Estimate, interval, resampled_means
+from tslam_bench.scoring.info import SubmissionInfo, Training
+from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
 
 NAMES = ("mug", "toruslarge")
 
@@ -453,7 +453,7 @@ def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path:
     with pytest.raises(AssetError, match="assets prepare"):
         page_main([str(run / "submissions" / "mine-hull"), "--output", str(tmp_path)])
     assert not (tmp_path / "index.html").exists()
-    monkeypatch.setattr("tslam_bench.leaderboard.scoring.QUICK_OBJECTS", NAMES)
+    monkeypatch.setattr("tslam_bench.scoring.scoring.QUICK_OBJECTS", NAMES)
     page_main([str(run / "submissions" / "mine-hull"), "--output", str(tmp_path), "--pictured", "0"])
     assert json.loads((tmp_path / "leaderboard.json").read_text())["tables"][0]["object_set"] == "quick"
 

@@ -16,9 +16,9 @@ import trimesh
 from objects import prepare_primitive
 
 from tslam_bench import cli, grids
-from tslam_bench.assets import store
 from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.objects import store
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.training_objects import load_training_shapes, training_names
 
@@ -204,7 +204,7 @@ def test_training_shapes_come_from_the_prepared_objects(cache):
 
 def test_listing_needs_no_torch():
     code = (
-        "import sys; from tslam_bench.reconstruction.commands import main; main(['list']);"
+        "import sys; from tslam_bench.cli.reconstruct import main; main(['list']);"
         "from tslam_bench.reconstruction.registry import make_reconstructor; make_reconstructor('hull');"
         "sys.exit('torch' in sys.modules or 'sapien' in sys.modules)"
     )

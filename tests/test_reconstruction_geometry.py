@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay
 from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.leaderboard.metrics import iou
+from tslam_bench.geometry.sampling import iou_points
 from tslam_bench.reconstruction.carve import CarveReconstructor, carved_voxels
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
@@ -20,7 +20,7 @@ from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.priors import MeanShapeReconstructor, RetrievalReconstructor, turn_grid
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.training_shapes import axis_rotations
-from tslam_bench.sampling import iou_points
+from tslam_bench.scoring.metrics import iou
 
 EMPTY = np.zeros((GRID_SIZE,) * 3, dtype=bool)
 

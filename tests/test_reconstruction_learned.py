@@ -15,7 +15,7 @@ import trimesh
 from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.leaderboard.metrics import iou
+from tslam_bench.geometry.sampling import iou_points
 from tslam_bench.reconstruction import convonet, ifnet
 from tslam_bench.reconstruction.feature_sampling import sample_features
 from tslam_bench.reconstruction.learned import (
@@ -30,7 +30,7 @@ from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulat
 from tslam_bench.reconstruction.training import THRESHOLDS, best_threshold, draw_batch, learning_rate, train
 from tslam_bench.reconstruction.training_config import TrainingConfig
 from tslam_bench.reconstruction.training_shapes import place, training_shape
-from tslam_bench.sampling import iou_points
+from tslam_bench.scoring.metrics import iou
 
 torch.set_num_threads(1)
 EMPTY = np.zeros((GRID_SIZE,) * 3, dtype=bool)

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from tslam_bench.constants import VOXEL_EDGE
+from tslam_bench.geometry.render import Camera, fit_camera, render, voxels_to_mesh
 from tslam_bench.grids import points_to_grid
-from tslam_bench.leaderboard.render import Camera, fit_camera, render, voxels_to_mesh
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 FRONT = Camera((0.0, 0.0, 0.0), azimuth=-90, elevation=0, height=0.25)

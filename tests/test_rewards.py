@@ -8,10 +8,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from tslam_bench.constants import REWARD_MODES, VOXEL_EDGE, WORKSPACE_EDGE
-from tslam_bench.tasks.alpha_shape import alpha_shape_samples, alpha_shape_triangles, chamfer_l2, thin_out
-from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
-from tslam_bench.tasks.rewards import COVERAGE_WEIGHT, MODE_SCALE, SURFACE_SUBSAMPLE, Rewards
-from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, Contacts
+from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
+from tslam_bench.engine.rewards import COVERAGE_WEIGHT, MODE_SCALE, SURFACE_SUBSAMPLE, Rewards
+from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, Contacts
+from tslam_bench.geometry.alpha_shape import alpha_shape_samples, alpha_shape_triangles, chamfer_l2, thin_out
 
 ENVS, PROBES, STEPS = 3, 50, 8
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from tslam_bench import cli
-from tslam_bench.assets.generate import candidates
-from tslam_bench.baselines.jobs import Job, JobError, JobRunner
-from tslam_bench.baselines.registry import list_baselines
 from tslam_bench.baselines.run import PRESETS, Arguments, plan, settings_of
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.jobs import Job, JobError, JobRunner
+from tslam_bench.evaluation.policies import list_baselines
+from tslam_bench.sources.generator.generate import candidates
 
 ROOT = Path(__file__).parent.parent
 
@@ -231,7 +231,7 @@ def test_a_job_of_two_slots_runs_alone(tmp_path: Path) -> None:
 def test_two_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from tslam_bench.baselines.jobs import Job, JobRunner\n"
+        "from tslam_bench.evaluation.jobs import Job, JobRunner\n"
         "from pathlib import Path\n"
         f"job = Job('long', ({sys.executable!r}, '-c', 'import time; time.sleep(60)'))\n"
         f"JobRunner(Path({str(tmp_path)!r}), 1, print, lambda *_: None).run([job])\n"

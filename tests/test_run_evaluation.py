@@ -14,8 +14,13 @@ import torch
 from baseline_assets import SHAPES, primitive_cache
 
 import tslam_bench
-from tslam_bench.baselines import evaluate as evaluation
-from tslam_bench.baselines.evaluate import (
+from tslam_bench.baselines.learned_policy import LearnedBaseline
+from tslam_bench.baselines.model_files import make_network
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
+from tslam_bench.episodes import check_salt, episode_seed, new_salt, policy_seed, shuffled
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation import evaluate as evaluation
+from tslam_bench.evaluation.evaluate import (
     EvaluationConfig,
     episode_path,
     evaluate,
@@ -23,16 +28,11 @@ from tslam_bench.baselines.evaluate import (
     merged_grids,
     reference_grids,
 )
-from tslam_bench.baselines.learned import LearnedBaseline
-from tslam_bench.baselines.model_files import make_network
-from tslam_bench.baselines.registry import make_baseline
-from tslam_bench.baselines.rollout import Rollout, roll_out, roll_out_batch
-from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, VOXEL_EDGE
-from tslam_bench.episodes import check_salt, episode_seed, new_salt, policy_seed, shuffled
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import make_baseline
+from tslam_bench.evaluation.rollouts import Rollout, roll_out, roll_out_batch
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.grids import voxel_centres, world_to_object
-from tslam_bench.leaderboard.submission import read_submission
+from tslam_bench.scoring.submission import read_submission
 
 SALT = "5a17"
 PHONE = np.array(SHAPES["test"]["phone"]) / 2

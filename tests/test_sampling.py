@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tslam_bench.constants import IOU_BOX_MARGIN, IOU_INSIDE_POINTS, WORKSPACE_EDGE
-from tslam_bench.sampling import iou_cells, iou_points
+from tslam_bench.geometry.sampling import iou_cells, iou_points
 
 LOW, HIGH = np.array([-0.06, -0.03, -0.02]), np.array([0.06, 0.03, 0.02])
 

@@ -16,9 +16,10 @@ from objects import surface_grid
 from tslam_bench import __version__, grids
 from tslam_bench.constants import HORIZON, WORKSPACE_EDGE
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.leaderboard import metrics
-from tslam_bench.leaderboard.info import SubmissionInfo
-from tslam_bench.leaderboard.scoring import (
+from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring import metrics
+from tslam_bench.scoring.info import SubmissionInfo
+from tslam_bench.scoring.scoring import (
     SHAPE_METRICS,
     SubmissionScore,
     Truth,
@@ -28,14 +29,13 @@ from tslam_bench.leaderboard.scoring import (
     score_object,
     score_reconstruction,
 )
-from tslam_bench.leaderboard.submission import (
+from tslam_bench.scoring.submission import (
     EXPLORATION_ORDER,
     RECONSTRUCTED_POSES,
     Submission,
     SubmissionWriter,
     read_submission,
 )
-from tslam_bench.reconstruction.volume import Volume
 
 INFO = SubmissionInfo(
     method="Test",

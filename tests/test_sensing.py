@@ -9,14 +9,14 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from tslam_bench import grids
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import SignedDistanceField
 from tslam_bench.constants import TOUCH_DISTANCE
+from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
+from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, FieldAtlas, TactileSensing
+from tslam_bench.engine.sensing_numba import CompiledSensing
+from tslam_bench.engine.skin import Skin, build_skin
 from tslam_bench.hand_constants import SKIN_LINKS
-from tslam_bench.tasks.arrays import NumpyBackend, TorchBackend
-from tslam_bench.tasks.compiled_sensing import CompiledSensing
-from tslam_bench.tasks.sensing import MAX_NEW_CONTACTS, FieldAtlas, TactileSensing
-from tslam_bench.tasks.skin import Skin, build_skin
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import SignedDistanceField
 
 RADIUS, OFFSET = 0.05, np.array([0.02, -0.01, 0.015])
 

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from tslam_bench.assets import contactdb, store
-from tslam_bench.assets.hand import load_hand
 from tslam_bench.constants import NUM_POSES, WORKSPACE_EDGE
+from tslam_bench.engine.hand_batch import OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.skin import build_skin
+from tslam_bench.engine.starts import StartSampler
 from tslam_bench.episodes import episode_seed
 from tslam_bench.hand_constants import START_ARM_HIGH, START_ARM_LOW
-from tslam_bench.tasks.batch import OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
-from tslam_bench.tasks.skin import build_skin
-from tslam_bench.tasks.starts import StartSampler
+from tslam_bench.objects import splits, store
+from tslam_bench.objects.hand import load_hand
 
-PREPARED = [name for name in contactdb.OBJECTS if name in store.prepared_names("test")]
+PREPARED = [name for name in splits.OBJECTS if name in store.prepared_names("test")]
 """All 50 test objects where the whole split is prepared; the quick ones and a few more on a fresh machine."""
 
 

@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from tslam_bench.assets import contactdb, store
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.objects import splits, store
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_what_is_written_is_loaded(cache, torus):
 
 def test_aliases_and_split_names_resolve(cache):
     assert store.load_object("coffeemug", "contactdb50", cache).name == "mug"
-    assert set(contactdb.ALIASES.values()) <= set(contactdb.OBJECTS)
+    assert set(splits.ALIASES.values()) <= set(splits.OBJECTS)
 
 
 def test_list_objects(cache):

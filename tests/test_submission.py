@@ -17,9 +17,10 @@ import trimesh
 
 from tslam_bench import __version__, grids
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.leaderboard import sources
-from tslam_bench.leaderboard.info import SubmissionInfo, Training, parse_info
-from tslam_bench.leaderboard.submission import (
+from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring import untrusted_files
+from tslam_bench.scoring.info import SubmissionInfo, Training, parse_info
+from tslam_bench.scoring.submission import (
     EXPLORATION_ORDER,
     RECONSTRUCTED_POSES,
     SubmissionWriter,
@@ -27,7 +28,6 @@ from tslam_bench.leaderboard.submission import (
     reconstruction_name,
     rollout_name,
 )
-from tslam_bench.reconstruction.volume import Volume
 
 INFO = SubmissionInfo(
     method="Test method",
@@ -497,7 +497,7 @@ def test_limits_on_files_and_sizes(folder: Path, monkeypatch: pytest.MonkeyPatch
         ("MAX_TOTAL_SIZE", 5000, "bytes uncompressed"),
     ]:
         with monkeypatch.context() as patch:
-            patch.setattr(sources, limit, value)
+            patch.setattr(untrusted_files, limit, value)
             refused(folder, fragment)
             refused(zipped(folder), fragment)
     read_submission(folder)

@@ -8,11 +8,11 @@ import pytest
 
 import tslam_bench
 from tslam_bench import grids
-from tslam_bench.assets.hand import load_hand
-from tslam_bench.assets.store import load_object
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS, QUICK_OBJECTS, TABLE_SIZE, TABLETOP_ID, VOXEL_EDGE
+from tslam_bench.engine.skin import build_skin, dense_volume_points
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.tasks.skin import build_skin, dense_volume_points
+from tslam_bench.objects.hand import load_hand
+from tslam_bench.objects.store import load_object
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,16 @@ from baseline_assets import primitive_cache
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tslam_bench.baselines import training
-from tslam_bench.baselines.evaluate import EvaluationConfig, evaluate, make_reconstructors
 from tslam_bench.baselines.model_files import read_model
-from tslam_bench.baselines.registry import make_baseline
 from tslam_bench.baselines.training import train
-from tslam_bench.baselines.training_config import MODEL_FILE, TrainingConfig
+from tslam_bench.baselines.training_config import TrainingConfig
 from tslam_bench.constants import HORIZON
+from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.evaluation.evaluate import EvaluationConfig, evaluate, make_reconstructors
+from tslam_bench.evaluation.policies import MODEL_FILE, make_baseline
 from tslam_bench.files import CACHE_VARIABLE
-from tslam_bench.leaderboard.submission import read_submission
-from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
+from tslam_bench.scoring.submission import read_submission
 
 CONFIG = TrainingConfig(
     baseline="tslam",

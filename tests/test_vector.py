@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 import tslam_bench
-from tslam_bench.baselines.vector import TactileVecEnv
+from tslam_bench.baselines.sb3_adapter import TactileVecEnv
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 
@@ -207,7 +207,7 @@ def test_stable_baselines3_trains_in_the_real_environment_with_held_actions() ->
 @pytest.mark.parametrize("repeat", [1, 4])
 def test_a_batched_maniskill_task_is_the_same_vector_environment(repeat: int) -> None:
     """What CUDA uses, on the CPU with one environment: observations, rewards and ends as ``make_vec``'s, bit for bit."""
-    from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
+    from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
 
     arguments = {"objects": ("mug", "hammer")}
     batched = BatchedVectorEnv(gym.make(ENVIRONMENT_ID, **arguments), repeat)

@@ -17,8 +17,8 @@ import torch
 
 import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, TABLETOP_ID
+from tslam_bench.engine.worker_vector_env import WorkerError
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.tasks.vector_env import WorkerError
 
 OBJECTS = ("mug", "hammer", "toruslarge")
 

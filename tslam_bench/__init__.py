@@ -11,9 +11,15 @@ Importing this package registers every environment id with Gymnasium::
 The simulator is imported when an environment is made, not before: metrics and scoring do without it.
 """
 
+from pathlib import Path as _Path
+
 from tslam_bench.registration import make_vec, register_environments
+from tslam_bench.version import __version__
 
 __all__ = ["__version__", "make_vec"]
-__version__ = "0.1.0"
+
+# In a clone the leaves (tasks, baselines, leaderboard) and assets lie beside this folder; a wheel has them inside it.
+if not (_Path(__file__).parent / "tasks").is_dir():
+    __path__.append(str(_Path(__file__).resolve().parents[1]))
 
 register_environments()

@@ -50,6 +50,16 @@ def ensure_writable_directory(directory: Path) -> Path:
     return directory
 
 
+def package_data(*parts: str) -> Path:
+    """A file or folder that comes with the package outside its modules: ``package_data("assets", "manifest_test.json")``.
+
+    A wheel has it inside the package, a clone beside it.
+    """
+    package = Path(__file__).parent
+    inside = package.joinpath(*parts)
+    return inside if inside.exists() else package.parent.joinpath(*parts)
+
+
 def sha256_file(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes."""
     digest = hashlib.sha256()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,12 +13,15 @@ from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.variants import ENVIRONMENT_IDS, get_variant
 
+_TASKS = ("tslam_bench.tasks.tactile_slam", "tslam_bench.tasks.tabletop")
+
 
 def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     """Makes the unwrapped environment; what ``gymnasium.make`` calls."""
     from mani_skill.utils import registration
 
-    import tslam_bench.tasks.tactile_slam  # noqa: F401  (registers with ManiSkill)
+    for module in _TASKS:
+        importlib.import_module(module)  # registers with ManiSkill
 
     return registration.make(environment_id, **kwargs)
 
@@ -81,8 +85,8 @@ def make_vec(
         )
     if device == "cuda":
         raise InvalidInputError("device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto")
-    from tslam_bench.tasks.batch import BatchSettings
-    from tslam_bench.tasks.vector_env import TactileVectorEnv
+    from tslam_bench.engine.hand_batch import BatchSettings
+    from tslam_bench.engine.worker_vector_env import TactileVectorEnv
 
     chosen = None if objects is None else tuple(objects)
     settings = BatchSettings(object, chosen, split, pose, reward_mode, control_mode, environment_id)
@@ -98,7 +102,7 @@ def _cuda_available() -> bool:
 def _make_cuda_vec(
     environment_id: str, num_envs: int, kwargs: dict[str, Any], action_repeat: int
 ) -> gymnasium.vector.VectorEnv:
-    from tslam_bench.tasks.batched_vector_env import BatchedVectorEnv
+    from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
 
     environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)  # GPU only
     return BatchedVectorEnv(environment, action_repeat)

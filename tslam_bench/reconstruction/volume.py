@@ -25,7 +25,7 @@ class Volume:
     Attributes:
         probability: (R, R, R) float32 in [0, 1], index ``[ix, iy, iz]``; converted to float32 if it is not.
         interpolation: how the samples extend over W. ``"nearest"``: constant in each cell. ``"linear"``: linear on
-            the 24 tetrahedra of each cell between centres (:mod:`tslam_bench.reconstruction.isosurface`), constant from the
+            the 24 tetrahedra of each cell between centres (:mod:`tslam_bench.geometry.isosurface`), constant from the
             outermost centres to the faces of W.
 
     Raises:
@@ -67,7 +67,7 @@ class Volume:
             index = np.clip(np.floor(cells).astype(np.int64), 0, self.resolution - 1)
             result = self.probability[index[:, 0], index[:, 1], index[:, 2]]
         else:
-            from tslam_bench.reconstruction.isosurface import interpolate
+            from tslam_bench.geometry.isosurface import interpolate
 
             result = interpolate(self.probability, cells - 0.5)
         inside = ((cells >= 0) & (cells < self.resolution)).all(axis=1)
@@ -95,7 +95,7 @@ class Volume:
             raise InvalidInputError(f"threshold {threshold}: must lie strictly between 0 and 1")
         if self.interpolation == "nearest":
             return _cell_faces(self.probability >= threshold)
-        from tslam_bench.reconstruction.isosurface import surface
+        from tslam_bench.geometry.isosurface import surface
 
         try:
             return surface(self.probability, threshold)

@@ -1,0 +1,97 @@
+"""Learned explorers: a trained PPO policy behind the interface of every baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.evaluation.policies import BaselineSpec
+from tslam_bench.evaluation.policy import check_observation, episode_generators
+from tslam_bench.hand_constants import CONTROL_MODES
+
+from .model_files import read_model
+from .network import PolicyNetwork
+
+
+class LearnedBaseline:
+    """Samples from (or acts by the mean of) a trained Gaussian policy; actions are clipped to [-1, 1].
+
+    It decides every ``action_repeat`` control steps and holds its action. The noise comes from each episode's seed. The paper
+    acts by the mean; the mean explores badly, so sampling, which is also what was optimised, is the default.
+
+    Args:
+        network: the policy.
+        control_mode: what its actions mean.
+        action_repeat: control steps that each action is held for.
+        deterministic: act by the mean.
+    """
+
+    def __init__(
+        self, network: PolicyNetwork, control_mode: str, action_repeat: int = 1, deterministic: bool = False
+    ) -> None:
+        self.control_mode = control_mode
+        self._network = network.eval().requires_grad_(False)
+        self._repeat = action_repeat
+        self._deterministic = deterministic
+        self._deviation = torch.exp(network.log_std).numpy()
+        self._generators: list[np.random.Generator] = []
+        self._step = 0
+
+    @classmethod
+    def load(cls, spec: BaselineSpec, directory: Path | None, deterministic: bool = False) -> LearnedBaseline:
+        """Loads the model that ``tslam-bench baselines train`` wrote to ``directory``.
+
+        Raises:
+            InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
+        """
+        command = f"tslam-bench baselines train {spec.id} --output {directory or 'DIRECTORY'}"
+        if directory is None:
+            raise InvalidInputError(
+                f"baseline {spec.id!r}: needs a trained model; pass its directory, or train one: {command}"
+            )
+        try:
+            network, metadata = read_model(directory)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{error}; train it: {command}") from error
+        config = metadata["config"]
+        mode, repeat = config.get("control_mode"), config.get("action_repeat")
+        if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
+            raise InvalidInputError(
+                f"{directory}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
+            )
+        return cls(network, mode, repeat, deterministic)
+
+    def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
+        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        self._generators = episode_generators(num_envs, seed)
+        self._step = 0
+
+    def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
+        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        check_observation(observation, len(self._generators))
+        if self._step % self._repeat == 0:
+            self._held = self._decide(observation)
+        self._step += 1
+        return self._held.copy()
+
+    def _decide(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
+        """(n, 28) new actions."""
+        with torch.inference_mode():
+            tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observation.items()}
+            encoded = self._network.encode(tensors)
+            # One at a time: the bits of a batched product depend on the batch, an episode must not.
+            rows = [
+                self._network.mean_action(encoded.rows(slice(row, row + 1))).numpy()
+                for row in range(len(self._generators))
+            ]
+        actions = np.concatenate(rows)
+        if not self._deterministic:
+            noise = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
+            actions = actions + self._deviation * np.stack(noise)
+        return np.clip(actions, -1, 1)

@@ -1,0 +1,214 @@
+"""``tslam-bench env``: list the environments, describe their spaces, record a video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from tslam_bench.constants import (
+    CONTROL_STEP_SECONDS,
+    ENVIRONMENT_ID,
+    HORIZON,
+    NUM_JOINTS,
+    PRIVILEGED_REWARD_MODES,
+    REWARD_MODES,
+)
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT, JOINT_LIMITS, JOINT_NAMES
+from tslam_bench.variants import VARIANTS, get_variant
+
+
+@dataclass(frozen=True)
+class List:
+    """List the environment ids."""
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+@dataclass(frozen=True)
+class Describe:
+    """Print the tables of actions, observations and reward modes, generated from the environment's spaces."""
+
+    environment: Annotated[str, tyro.conf.Positional] = ENVIRONMENT_ID
+    """Environment id."""
+    object: str = "mug"
+    """A prepared object to make the environment with."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """Record one episode of a registered explorer as an animated picture (needs a Vulkan device)."""
+
+    environment: str = ENVIRONMENT_ID
+    """Environment id."""
+    object: str = "mug"
+    """A prepared object of any split."""
+    pose: int = 0
+    """Pose, one of the environment's."""
+    baseline: str = "heuristic"
+    """A scripted explorer (tslam-bench baselines list)."""
+    seed: int = 0
+    """Seed of the episode."""
+    every: int = 2
+    """Keep every n-th control step."""
+    output: Path = Path("video.webp")
+    """File to write (.webp or .gif)."""
+
+
+Command = (
+    Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Describe, tyro.conf.subcommand("describe")]
+    | Annotated[Video, tyro.conf.subcommand("video")]
+)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Runs ``tslam-bench env`` with the given arguments. Raises BenchmarkError for bad input."""
+    command: Any = tyro.cli(
+        Command,
+        args=list(arguments),
+        prog="tslam-bench env",
+        description="List the environments, describe their spaces, record a video.",
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    handlers: dict[type, Callable[[Any], None]] = {List: _list, Describe: _describe, Video: _video}
+    handlers[type(command)](command)
+
+
+def environment_rows() -> list[dict[str, Any]]:
+    """One record per registered environment id."""
+    return [
+        {
+            "id": variant.id,
+            "summary": variant.summary,
+            "poses": len(variant.poses),
+            "horizon": HORIZON,
+            "seconds": round(HORIZON * CONTROL_STEP_SECONDS, 2),
+            "actions": NUM_JOINTS,
+        }
+        for variant in VARIANTS.values()
+    ]
+
+
+def action_rows() -> list[dict[str, Any]]:
+    """One record per action, in order."""
+    rows = []
+    for index, name in enumerate(JOINT_NAMES):
+        unit = "m" if name in ("ARTx", "ARTy", "ARTz") else "rad"
+        low, high = (float(v) for v in JOINT_LIMITS[index])
+        rows.append(
+            {
+                "index": index,
+                "joint": name,
+                "lower": low,
+                "upper": high,
+                "unit": unit,
+                "delta_per_step": float(DELTA_STEP[index]),
+                "force_limit": float(FORCE_LIMIT[index]),
+            }
+        )
+    return rows
+
+
+def reward_rows() -> list[dict[str, Any]]:
+    """One record per reward mode."""
+    return [{"reward_mode": mode, "privileged": mode in PRIVILEGED_REWARD_MODES} for mode in REWARD_MODES]
+
+
+def observation_rows(environment: Any) -> list[dict[str, Any]]:
+    """One record per entry of the environment's single observation space."""
+    space = environment.unwrapped.single_observation_space
+    return [
+        {
+            "key": key,
+            "shape": list(box.shape),
+            "dtype": str(box.dtype),
+            "low": float(box.low.min()),
+            "high": float(box.high.max()),
+        }
+        for key, box in space.spaces.items()
+    ]
+
+
+def _print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
+    table = Table(title=title)
+    for index, heading in enumerate(rows[0]):
+        table.add_column(heading, no_wrap=index == 0)  # a name must not be cut
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    console = Console()
+    console = Console(width=max(console.width, 100))  # a pipe has no width
+    console.print(table)
+
+
+def _list(command: List) -> None:
+    rows = environment_rows()
+    print(json.dumps(rows, indent=2)) if command.json else _print_rows("environments", rows)
+
+
+def _describe(command: Describe) -> None:
+    import gymnasium
+
+    environment = gymnasium.make(get_variant(command.environment).id, object=command.object)
+    tables = {
+        "observations": observation_rows(environment),
+        "actions": action_rows(),
+        "reward modes": reward_rows(),
+    }
+    environment.close()
+    if command.json:
+        print(json.dumps(tables, indent=2).replace("Infinity", "null"))
+        return
+    for title, rows in tables.items():
+        _print_rows(title, rows)
+
+
+def _video(command: Video) -> None:
+    import gymnasium
+    import numpy as np
+    from PIL import Image
+    from tqdm import tqdm
+
+    from tslam_bench.engine.rendering import vulkan_device_available
+    from tslam_bench.files import atomic_file
+
+    variant = get_variant(command.environment)
+    if command.output.suffix not in (".webp", ".gif"):
+        raise InvalidInputError(f"{command.output}: unknown kind of video; end the name in .webp or .gif")
+    if not vulkan_device_available():
+        raise AssetError(
+            "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU"
+        )
+    from tslam_bench.evaluation.policies import make_baseline  # a command may use what the library must not
+
+    explorer = make_baseline(command.baseline)
+    environment = gymnasium.make(
+        variant.id,
+        object=command.object,
+        pose=command.pose,
+        control_mode=explorer.control_mode,
+        render_mode="rgb_array",
+    )
+    observation, _ = environment.reset(seed=command.seed)
+    explorer.reset(1, command.seed)
+    frames = []
+    for step in tqdm(range(HORIZON), desc="steps"):
+        action = explorer.act({key: value.numpy() for key, value in observation.items()})
+        observation, *_ = environment.step(action)
+        if step % command.every == 0:
+            frames.append(Image.fromarray(np.asarray(environment.render())[0]))
+    environment.close()
+    milliseconds = round(1000 * CONTROL_STEP_SECONDS * command.every)
+    with atomic_file(command.output) as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
+    Console().print(f"{command.output}: {len(frames)} frames")

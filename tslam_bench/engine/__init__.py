@@ -1,0 +1,1 @@
+"""Simulation, sensing and rewards of many hands; the vector environments."""

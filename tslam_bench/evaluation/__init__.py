@@ -1,0 +1,1 @@
+"""Policies, rollouts, evaluations and jobs."""

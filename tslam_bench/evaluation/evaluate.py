@@ -1,0 +1,309 @@
+"""Evaluates one explorer: episodes, merged grids, reconstructions, submissions (protocol sections 6, 9 and 12).
+
+Layout below the output folder::
+
+    rollouts/<explorer>/source.json
+    rollouts/<explorer>/<object>/pose<k>_seed<s>.npz
+    submissions/<explorer>-<reconstructor>/
+
+Every file is written whole or not at all and is not made again, so a run that was killed goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.episodes import check_salt, new_salt, shuffled
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, BaselineSpec, get_baseline, make_baseline
+from tslam_bench.evaluation.rollouts import Rollout, roll_out_batch
+from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
+from tslam_bench.grids import merge, world_to_object
+from tslam_bench.hand_constants import CONTROL_MODES
+from tslam_bench.objects.store import asset_sha256, known_names, load_object, resolve_name
+from tslam_bench.reconstruction.registry import make_reconstructor
+from tslam_bench.reconstruction.volume import Reconstructor
+from tslam_bench.registration import make_vec
+from tslam_bench.scoring.info import SubmissionInfo, Training
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
+from tslam_bench.version import __version__
+
+SOURCE_FILE: Final = "source.json"
+SIDE_BY_SIDE: Final = 8
+"""Episodes that are rolled out at a time."""
+Grid = NDArray[np.bool_]
+Grids = tuple[Grid, Grid]
+"""Touched and visited."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What to evaluate.
+
+    Attributes:
+        baseline: registered id.
+        objects: objects of the test split; aliases are resolved.
+        seeds: repetitions; each is 8 episodes per object.
+        object_set: ``quick`` or ``test``: which ranking the submissions are for.
+        model: directory of the trained model of a learned baseline.
+        deterministic: a learned baseline acts by the mean of its policy.
+        policy_salt: hexadecimal digits from which the explorer's random numbers and the order of the episodes come; None
+            takes that of the episodes which are there already, or draws one.
+        label: remark that is shown beside every figure of the submission.
+        processes: worker processes that simulate; None means the cores. Results do not depend on it.
+    """
+
+    baseline: str
+    objects: tuple[str, ...]
+    seeds: tuple[int, ...] = (0,)
+    object_set: Literal["quick", "test"] = "test"
+    model: Path | None = None
+    deterministic: bool = False
+    policy_salt: str | None = None
+    label: str = ""
+    processes: int | None = None
+
+    def __post_init__(self) -> None:
+        get_baseline(self.baseline)
+        if self.policy_salt is not None:
+            check_salt(self.policy_salt)
+        if not self.objects or not self.seeds:
+            raise InvalidInputError("evaluation: give at least one object and one seed")
+        if min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
+            raise InvalidInputError(f"seeds {list(self.seeds)}: must be different and not negative")
+        object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name) for name in self.objects)))
+
+
+def default_objects(object_set: str) -> tuple[str, ...]:
+    """Objects of an object set: the five quick ones, or the test split."""
+    return QUICK_OBJECTS if object_set == "quick" else tuple(known_names("test"))
+
+
+def make_reconstructors(
+    specifications: Sequence[str], learning_objects: Sequence[str] = ()
+) -> dict[str, Reconstructor]:
+    """Reconstructors by id, from ``ID`` or, for those that have learned, ``ID=MODEL``; ``none`` alone gives none.
+
+    ``learning_objects`` names the train objects that ``mean_shape`` and ``retrieval`` are built from; empty: all prepared.
+
+    Raises:
+        InvalidInputError: unknown id, a model that is missing or unreadable, or one id twice.
+    """
+    if tuple(specifications) == ("none",):
+        return {}
+    reconstructors: dict[str, Reconstructor] = {}
+    for specification in specifications:
+        name, _, model = specification.partition("=")
+        if name in reconstructors:
+            raise InvalidInputError(f"reconstructor {name!r}: given twice")
+        reconstructors[name] = make_reconstructor(name, Path(model) if model else None, objects=learning_objects)
+    return reconstructors
+
+
+def evaluate(
+    config: EvaluationConfig,
+    reconstructors: Mapping[str, Reconstructor],
+    output: Path,
+    on_progress: Callable[[str, int, int], None] | None = None,
+) -> list[Path]:
+    """Explores every object in all 8 poses, reconstructs from 1, 2, 4 and 8 merged poses, and writes one submission per
+    reconstructor.
+
+    Args:
+        config: what to evaluate.
+        reconstructors: by id.
+        output: folder of the run.
+        on_progress: called with (stage, done, total) after each episode and each object.
+
+    Returns:
+        The submissions' folders.
+
+    Raises:
+        InvalidInputError: a model is missing, or ``output`` holds episodes of another model.
+        AssetError: an object is not prepared, or ``output`` cannot be written.
+    """
+    spec = get_baseline(config.baseline)
+    report = on_progress or (lambda stage, done, total: None)
+    folder = output / "rollouts" / spec.id
+    source = explore(config, folder, report) if spec.kind != "reference" else {}
+    submissions = []
+    for name, reconstructor in reconstructors.items():
+        submission = output / "submissions" / f"{spec.id}-{name}"
+        with SubmissionWriter(submission, submission_info(config, name, source)) as writer:
+            total = len(config.objects) * len(config.seeds)
+            for done, (object_name, seed) in enumerate(_repetitions(config)):
+                _add_object(writer, spec, folder, reconstructor, object_name, seed)
+                report(f"reconstruct {name}", done + 1, total)
+        submissions.append(submission)
+    return submissions
+
+
+def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, int], None]) -> dict[str, Any]:
+    """Rolls out every episode that ``folder`` lacks, in an order that the salt shuffles.
+
+    Returns:
+        what the episodes depend on: the content of ``source.json``.
+
+    Raises:
+        InvalidInputError: ``folder`` holds episodes of another model, of other assets or of another salt.
+    """
+    baseline = make_baseline(config.baseline, config.model, config.deterministic)
+    path = ensure_writable_directory(folder) / SOURCE_FILE
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    salt = config.policy_salt or known.get("policy_salt") or new_salt()
+    source = _source(config, baseline.control_mode, salt)
+    if known not in ({}, source):
+        differing = ", ".join(key for key in source if known.get(key) != source[key])
+        raise InvalidInputError(f"{folder}: holds other episodes (another {differing}); delete it or move it away")
+    write_json(path, source)
+    episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
+    missing = [e for e in shuffled(salt, episodes) if not episode_path(folder, *e).is_file()]
+    report("explore", len(episodes) - len(missing), len(episodes))
+    if not missing:
+        return source
+    width, done = min(SIDE_BY_SIDE, len(missing)), len(episodes) - len(missing)
+    envs = make_vec(
+        ENVIRONMENT_ID,
+        width,
+        "cpu",
+        objects=config.objects,
+        split="test",
+        control_mode=baseline.control_mode,
+        processes=config.processes,
+    )
+    try:
+        for first in range(0, len(missing), width):
+            for rollout in roll_out_batch(envs, baseline, missing[first : first + width], salt):
+                rollout.save(episode_path(folder, rollout.object, rollout.pose, rollout.seed))
+                done += 1
+                report("explore", done, len(episodes))
+    finally:
+        envs.close()
+    return source
+
+
+def episode_path(folder: Path, object_name: str, pose: int, seed: int) -> Path:
+    """Where an episode lies below an explorer's folder."""
+    return folder / object_name / f"pose{pose}_seed{seed}.npz"
+
+
+def merged_grids(rollouts: Sequence[Rollout]) -> Grids:
+    """Touched and visited of several poses of one object, carried into the object frame and united."""
+    touched = merge(world_to_object(rollout.touched, rollout.pose) for rollout in rollouts)
+    visited = merge(world_to_object(rollout.visited, rollout.pose) for rollout in rollouts)
+    return touched, visited
+
+
+def reference_grids(identifier: str, object_name: str) -> Grids:
+    """Grids of a reference explorer in the object frame.
+
+    ``oracle``: every voxel that the true surface crosses is touched, every voxel whose centre is outside is visited.
+    ``nothing``: both empty.
+    """
+    if identifier == "nothing":
+        return np.zeros((GRID_SIZE,) * 3, dtype=bool), np.zeros((GRID_SIZE,) * 3, dtype=bool)
+    prepared = load_object(object_name)
+    return prepared.surface.copy(), ~prepared.solid
+
+
+def manifest_sha256(config: EvaluationConfig) -> str:
+    """Hash of the object set's assets; of the evaluated objects alone while the set is not prepared as a whole.
+
+    Raises:
+        AssetError: an evaluated object is not prepared.
+    """
+    try:
+        return asset_sha256(default_objects(config.object_set))
+    except AssetError:
+        return asset_sha256(config.objects)
+
+
+def submission_info(config: EvaluationConfig, reconstructor: str, source: Mapping[str, Any]) -> SubmissionInfo:
+    """What the submission says about itself; budget and hardware come from the model's metadata.
+
+    ``source`` is what :func:`explore` returned, empty for a reference.
+    """
+    spec = get_baseline(config.baseline)
+    training = Training()
+    if spec.kind == "learned" and config.model is not None:
+        metadata = _model_metadata(config.model)
+        machine = metadata["machine"]
+        training = Training(
+            steps=int(metadata["steps"]),
+            wall_time_hours=float(metadata["seconds"]) / 3600,
+            hardware=f"{machine['processor']}, {machine['cores']} cores",
+        )
+    return SubmissionInfo(
+        method=f"{spec.id} + {reconstructor}",
+        explorer=spec.id,
+        reconstructor=reconstructor,
+        authors=("The tslam-bench authors",),
+        asset_manifest_sha256=manifest_sha256(config),
+        seeds=config.seeds,
+        object_set=config.object_set,
+        privileged=spec.privileged,
+        package_version=__version__,
+        reward_mode=spec.reward_mode,
+        control_mode=source.get("control_mode", CONTROL_MODES[0]),
+        policy_salt=source.get("policy_salt"),
+        training=training,
+        label=config.label,
+    )
+
+
+def _add_object(
+    writer: SubmissionWriter,
+    spec: BaselineSpec,
+    folder: Path,
+    reconstructor: Reconstructor,
+    object_name: str,
+    seed: int,
+) -> None:
+    """Adds one object's rollouts and reconstructions, those that are not there yet."""
+    missing = [n for n in RECONSTRUCTED_POSES if not writer.has_reconstruction(object_name, n, seed)]
+    if spec.kind == "reference":
+        if missing:
+            volume = reconstructor.reconstruct(*reference_grids(spec.id, object_name))
+            for count in missing:
+                writer.add_reconstruction(object_name, count, seed, volume)
+        return
+    rollouts = {pose: Rollout.load(episode_path(folder, object_name, pose, seed)) for pose in range(NUM_POSES)}
+    for pose, rollout in rollouts.items():
+        if not writer.has_rollout(object_name, pose, seed):
+            writer.add_rollout(
+                object_name, pose, seed, rollout.actions, rollout.touched, rollout.visited, rollout.touched_step
+            )
+    for count in missing:
+        grids = merged_grids([rollouts[pose] for pose in RECONSTRUCTED_POSES[count]])
+        writer.add_reconstruction(object_name, count, seed, reconstructor.reconstruct(*grids))
+
+
+def _repetitions(config: EvaluationConfig) -> Iterator[tuple[str, int]]:
+    return ((name, seed) for name in config.objects for seed in config.seeds)
+
+
+def _model_metadata(model: Path) -> dict[str, Any]:
+    return json.loads((model / METADATA_FILE).read_text(encoding="utf-8"))
+
+
+def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str, Any]:
+    """What the episodes depend on besides object, pose and seed."""
+    model = None if config.model is None else sha256_file(config.model / MODEL_FILE)
+    return {
+        "baseline": config.baseline,
+        "model_sha256": model,
+        "deterministic": config.deterministic,
+        "control_mode": control_mode,
+        "policy_salt": salt,
+        "asset_manifest_sha256": asset_sha256(config.objects),
+        "package_version": __version__,
+        "environment": ENVIRONMENT_ID,
+    }

@@ -1,0 +1,1 @@
+"""Meshes, fields and rays: mathematics that knows nothing of the benchmark."""

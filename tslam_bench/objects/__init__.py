@@ -1,0 +1,1 @@
+"""Prepared objects and the converted hand on disk: what tasks, training and scoring read."""

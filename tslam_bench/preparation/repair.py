@@ -1,0 +1,193 @@
+"""Makes any mesh one watertight solid: keep it if it is clean, else rebuild its surface.
+
+The ladder: a mesh that manifold3d accepts is kept as it is; one whose winding numbers are unambiguous is rebuilt from its
+exact distance with the winding sign; anything else is rebuilt by rolling a ball around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage import measure
+
+from tslam_bench.errors import AssetError
+from tslam_bench.geometry.distance import distance_to_mesh, sample_surface, winding_numbers
+from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, simplify, to_manifold, union
+
+MAX_TRIANGLES = 8_000
+"""Triangles of a ground-truth mesh."""
+REMESH_PITCH = 0.5e-3
+"""Sample spacing (m) when a surface is rebuilt ..."""
+REMESH_CELLS = 320
+"""... but never more than this many along the longest edge."""
+AMBIGUOUS_SHARE = 1e-3
+"""Winding numbers decide the sign where at most this share of points is further than 0.1 from an integer."""
+BALL_CELLS = 160
+"""Samples along the longest edge when a ball is rolled around a broken mesh."""
+BALL_SHARE = 0.02
+"""Radius of that ball as a share of the longest edge."""
+BALL_OFFSET = 0.9
+"""Outward offset of the rolled surface in sample spacings: less perforates sheets without thickness."""
+CRUMB_VOLUME = 1e-9
+"""Closed surfaces around less than this volume (m^3; a cubic millimetre) are dropped."""
+_SEED = 20211108
+
+Method = Literal["kept", "winding", "ball"]
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A clean solid and how it came about.
+
+    Attributes:
+        solid: one connected watertight solid, at most ``MAX_TRIANGLES`` triangles.
+        method: the step of the ladder that made it.
+        kept_share: volume of the kept part by that of all parts.
+    """
+
+    solid: manifold3d.Manifold
+    method: Method
+    kept_share: float
+
+
+def repair(mesh: TriangleMesh) -> Repaired:
+    """Runs the repair ladder on a mesh in metres.
+
+    Raises:
+        AssetError: nothing solid can be made of it.
+    """
+    a, b, c = mesh.triangles().transpose(1, 0, 2)
+    if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+        raise AssetError("the mesh has no area")
+    method: Method = "kept"
+    solid = to_manifold(mesh, merge=True)
+    if is_valid(solid) and solid.volume() < 0:
+        solid = to_manifold(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1]), merge=True)
+    if not is_valid(solid):
+        method = "winding" if winding_is_unambiguous(mesh) else "ball"
+        rebuilt = remesh_by_winding(mesh) if method == "winding" else remesh_by_ball(mesh)
+        solid = to_manifold(rebuilt)
+    if not is_valid(solid) or solid.volume() <= 0:
+        status = solid.status()
+        reason = "it encloses no volume" if status == manifold3d.Error.NoError else status.name
+        raise AssetError(f"no solid can be made of the mesh (repair by {method}: {reason})")
+    solid, kept_share = largest_part(solid)
+    simplified = _without_crumbs(simplify(solid, MAX_TRIANGLES))
+    if not is_valid(simplified):
+        raise AssetError("flat: nothing is left of the mesh when it is simplified")
+    return Repaired(simplified, method, kept_share)
+
+
+def _without_crumbs(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The solid without the tiny closed surfaces that simplification can pinch off."""
+    parts = solid.decompose()
+    kept = [part for part in parts if abs(part.volume()) >= CRUMB_VOLUME]
+    return solid if len(kept) == len(parts) or not kept else manifold3d.Manifold.compose(kept)
+
+
+def largest_part(solid: manifold3d.Manifold) -> tuple[manifold3d.Manifold, float]:
+    """The largest connected part with its inner voids, and its share of the whole volume.
+
+    Parts that overlap are united first.
+    """
+    parts = solid.decompose()
+    shells = [part for part in parts if part.volume() > 0]
+    voids = [part for part in parts if part.volume() < 0]
+    if not shells:
+        raise AssetError("the mesh encloses no volume")
+    if len(shells) > 1:
+        shells = [part for part in union(shells).decompose() if part.volume() > 0]
+    total = sum(part.volume() for part in shells)
+    best = max(shells, key=lambda part: part.volume())
+    share = float(best.volume() / total)
+    for void in voids:
+        outward = from_manifold(void)
+        best = best - to_manifold(TriangleMesh(outward.vertices, outward.faces[:, ::-1]))
+    return best, share
+
+
+def winding_is_unambiguous(mesh: TriangleMesh, count: int = 20_000) -> bool:
+    """Whether winding numbers are integers, zero or one, nearly everywhere in the bounding box."""
+    low, high = mesh.bounds
+    points = np.random.default_rng(_SEED).uniform(low, high, (count, 3))
+    winding = winding_numbers(points, mesh)
+    ambiguous = (np.abs(winding - np.round(winding)) > 0.1) | (winding < -0.5)
+    return bool(ambiguous.mean() <= AMBIGUOUS_SHARE and (winding > 0.5).any())
+
+
+def grid_around(mesh: TriangleMesh, spacing: float, padding: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
+    """Origin and shape of a grid that covers the mesh with padding on every side."""
+    low, high = mesh.bounds
+    size = np.ceil((high - low + 2 * padding) / spacing).astype(int) + 1
+    origin = (low + high) / 2 - (size - 1) * spacing / 2
+    return origin, (int(size[0]), int(size[1]), int(size[2]))
+
+
+def near_surface(
+    mesh: TriangleMesh, origin: NDArray[np.float64], spacing: float, shape: tuple[int, int, int]
+) -> NDArray[np.bool_]:
+    """Grid samples whose cell neighbourhood the surface passes (from samples four to a spacing)."""
+    a, b, c = mesh.triangles().transpose(1, 0, 2)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    count = int(np.clip(16 * area / spacing**2, 20_000, 8_000_000))
+    points, _ = sample_surface(mesh, count, np.random.default_rng(_SEED))
+    index = np.round((np.concatenate([points, mesh.vertices]) - origin) / spacing).astype(int)
+    near = np.zeros(shape, dtype=bool)
+    near[tuple(np.clip(index, 0, np.array(shape) - 1).T)] = True
+    return near
+
+
+def isosurface(
+    values: NDArray[np.float64], origin: NDArray[np.float64], spacing: float, level: float = 0.0
+) -> TriangleMesh:
+    """Marching cubes (solid where values < level), with samples nudged off the level so that the result is manifold."""
+    shifted = values - level
+    small = 0.02 * spacing
+    shifted = np.where(np.abs(shifted) < small, np.where(shifted < 0, -small, small), shifted)
+    vertices, faces, _, _ = measure.marching_cubes(shifted.astype(np.float32), 0.0, gradient_direction="descent")
+    return TriangleMesh(origin + vertices.astype(np.float64) * spacing, faces.astype(np.int64))
+
+
+def remesh_by_winding(mesh: TriangleMesh) -> TriangleMesh:
+    """Rebuilds the surface from exact distances with the sign of the winding number."""
+    spacing = max(REMESH_PITCH, float(mesh.extents.max()) / REMESH_CELLS)
+    origin, shape = grid_around(mesh, spacing, 4 * spacing)
+    band = ndimage.binary_dilation(near_surface(mesh, origin, spacing, shape), iterations=3)
+    values = np.full(shape, 3 * spacing)
+    index = np.argwhere(band)
+    points = origin + index * spacing
+    inside = winding_numbers(points, mesh) > 0.5
+    values[band] = np.where(inside, -1, 1) * distance_to_mesh(points, mesh)
+    # Away from the surface the sign is constant on connected regions: one winding number decides each.
+    regions, count = ndimage.label(~band)
+    if count:
+        labels, first = np.unique(regions.ravel(), return_index=True)
+        seeds = np.stack(np.unravel_index(first[labels > 0], shape), axis=1)
+        solid_region = np.concatenate([[False], winding_numbers(origin + seeds * spacing, mesh) > 0.5])
+        values[solid_region[regions]] = -3 * spacing
+    return isosurface(values, origin, spacing)
+
+
+def remesh_by_ball(mesh: TriangleMesh) -> TriangleMesh:
+    """Rebuilds the surface that a ball feels when it rolls around the mesh; works on any triangle soup.
+
+    Fills what the ball cannot enter (slits below its diameter, the inside of closed shells) and gives sheets without
+    thickness a thickness of twice the offset.
+    """
+    longest = float(mesh.extents.max())
+    spacing, radius = longest / BALL_CELLS, longest * BALL_SHARE
+    origin, shape = grid_around(mesh, spacing, 2 * radius + 3 * spacing)
+    distance = ndimage.distance_transform_edt(~near_surface(mesh, origin, spacing, shape)) * spacing
+    band = np.abs(distance - radius) < 2 * spacing
+    distance[band] = distance_to_mesh(origin + np.argwhere(band) * spacing, mesh)
+    regions, _ = ndimage.label(distance >= radius)
+    centres = regions == regions[0, 0, 0]
+    to_centres, nearest = ndimage.distance_transform_edt(~centres, return_indices=True)
+    # The nearest sample with room for the ball has a little room to spare: the ball itself can come that much closer.
+    spare = distance[tuple(nearest)] - radius
+    return isosurface(radius - BALL_OFFSET * spacing - (to_centres * spacing - spare), origin, spacing)

@@ -1,0 +1,1 @@
+"""Submissions, metrics and scores; imports neither torch nor a simulator."""

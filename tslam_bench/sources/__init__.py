@@ -1,0 +1,1 @@
+"""Where meshes come from: wheels, files of the user, the generator."""

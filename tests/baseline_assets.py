@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from objects import prepare_primitive
+from prepared_shapes import prepare_primitive
 
 from tslam_bench.constants import SURFACE_SAMPLES
 from tslam_bench.objects import store

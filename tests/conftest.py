@@ -7,7 +7,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: its threads wait for each other on small tensors
 
 import pytest
-from objects import prepared_box, prepared_sphere, prepared_torus
+from prepared_shapes import prepared_box, prepared_sphere, prepared_torus
 
 from tslam_bench.objects.store import PreparedObject
 

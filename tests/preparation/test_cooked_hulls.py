@@ -13,7 +13,7 @@ from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.engine import physics
 from tslam_bench.objects.store import load_object
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from cooked_hulls import cook
 
 

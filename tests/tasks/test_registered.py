@@ -110,7 +110,7 @@ def test_a_whole_episode_stays_in_its_spaces_and_repeats(environment_id):
 def test_bits_are_the_same_in_another_process():
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from test_environments import ENVIRONMENT_IDS, make, roll\n"
+        "from test_registered import ENVIRONMENT_IDS, make, roll\n"
         "print(*(roll(make('tslam_bench:' + name), 6, 80) for name in ENVIRONMENT_IDS))"
     )
     command = [sys.executable, "-c", code, str(Path(__file__).parent)]

@@ -33,7 +33,7 @@ from tslam_bench.hand_constants import (
 from tslam_bench.objects.splits import OBJECTS
 from tslam_bench.objects.store import load_object, prepared_names
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from penetration import pressing_audits
 
 

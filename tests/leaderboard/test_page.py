@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from objects import surface_grid
+from prepared_shapes import surface_grid
 
 from tslam_bench import __version__, grids
 from tslam_bench.cli import main

@@ -8,7 +8,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from objects import surface_grid
+from prepared_shapes import surface_grid
 from scipy.spatial.distance import cdist
 
 from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE

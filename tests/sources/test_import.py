@@ -29,8 +29,8 @@ from tslam_bench.sources.importer import read_set, scan
 from tslam_bench.sources.meshfiles import read_mesh_file
 from tslam_bench.sources.scaling import LONGEST_EDGE, scale_to_hand
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import build_importing
 import fuzz_importer
 import mesh_mutations

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from objects import prepare_primitive
+from prepared_shapes import prepare_primitive
 
 from tslam_bench import cli, grids
 from tslam_bench.constants import SURFACE_SAMPLES, VOXEL_EDGE

@@ -21,7 +21,7 @@ from tslam_bench.evaluation.jobs import Job, JobError, JobRunner
 from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.sources.generator.generate import candidates
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def runner(folder: Path, said: list[str] | None = None, workers: int = 2) -> JobRunner:

@@ -1,6 +1,6 @@
 """Prepared objects made from primitives, by real computation that shares no code with the asset pipeline.
 
-``from objects import prepared_box, prepared_sphere, prepared_torus``
+``from prepared_shapes import prepared_box, prepared_sphere, prepared_torus``
 """
 
 from __future__ import annotations

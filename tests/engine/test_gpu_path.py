@@ -243,7 +243,7 @@ def test_overflows_in_native_output_are_found():
 
 
 def test_the_list_of_lines_that_only_a_gpu_reaches_is_current():
-    script = Path(__file__).parent.parent / "docs" / "build_gpu.py"
+    script = Path(__file__).parents[2] / "docs" / "build_gpu.py"
     subprocess.run([sys.executable, str(script), "--check"], check=True)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fidelity import SPEED_LIMIT, SPEED_MARGIN, drive_speed, rest_drift, tracking_errors, violent_motion
-from objects import prepared_box
 from penetration import pressing_audits, statistics_of
+from prepared_shapes import prepared_box
 from tunnelling import AxisWatch, HullUnion, WallCounts
 
 from tslam_bench.hand_constants import SKIN_LINKS

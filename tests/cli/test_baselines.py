@@ -11,7 +11,7 @@ import pytest
 from tslam_bench import cli
 from tslam_bench.evaluation.policies import list_baselines
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def run(capsys, *arguments: str) -> tuple[int, str, str]:

@@ -23,13 +23,14 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch.utils.tensorboard import SummaryWriter
 
-import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
 from tslam_bench.objects.store import asset_sha256, list_objects
+from tslam_bench.registration import make_vec
+from tslam_bench.version import __version__
 
 from .model_files import make_network, write_model
 from .ppo import PPO
@@ -112,7 +113,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
         "mean_return": log.mean_return,
         "machine": machine_description(),
         "versions": {
-            "tslam_bench": tslam_bench.__version__,
+            "tslam_bench": __version__,
             "torch": str(torch.__version__),
             "python": platform.python_version(),
         },
@@ -125,7 +126,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
 
 def make_training_environments(config: TrainingConfig) -> VectorEnv:
     """The environments of a run: objects and poses drawn per episode; a step is a decision."""
-    return tslam_bench.make_vec(
+    return make_vec(
         ENVIRONMENT_ID,
         config.num_envs,
         config.device,

@@ -10,9 +10,9 @@ from typing import Annotated
 
 import tyro
 
-import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, QUICK_OBJECTS
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.registration import make_vec
 from tslam_bench.variants import get_variant
 
 
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> None:
     episodes = Episodes.draw(command.objects, variant.poses, command.num_envs, command.seed)
 
     def play(device: str, played: Episodes):
-        envs = tslam_bench.make_vec(
+        envs = make_vec(
             command.environment, command.num_envs, device, objects=command.objects, reward_mode=command.reward_mode
         )
         try:

@@ -14,8 +14,8 @@ set_up_environment() {
         return 0
     fi
     base="${PYTHON_FOR_VENV:-$(command -v python3.11 || command -v python3)}"
-    if ! "$base" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))'; then
-        echo "setup: $base is $("$base" --version 2>&1); set PYTHON_FOR_VENV to a Python 3.10, 3.11 or 3.12" >&2
+    if ! "$base" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))'; then
+        echo "setup: $base is $("$base" --version 2>&1); set PYTHON_FOR_VENV to a Python 3.11 or 3.12" >&2
         return 2
     fi
     echo "setup: installing into $root/.venv (once; a few minutes)"

@@ -7,7 +7,8 @@ usage() {
     cat <<'USAGE'
 usage: bash tests/run.sh [--fast] [pytest arguments]
 
-Does its own set-up (virtual environment, quick assets), then runs ruff, mypy and the test suite.
+Does its own set-up (virtual environment, quick assets), then runs ruff, mypy, the checks of generated pages,
+a tiny run of the whole chain and the test suite.
 
   --fast    skip the tests marked slow
   --help    this text
@@ -37,4 +38,10 @@ step "$PYTHON" -m tslam_bench.cli assets prepare --quick
 step "$PYTHON" -m tslam_bench.cli assets prepare --objects cubemedium cubesmall  # of the fidelity tests
 step "$PYTHON" docs/build_environment.py --check
 step "$PYTHON" docs/build_results.py --check
+if [ $# -eq 0 ]; then  # a chosen test needs no run of the whole chain
+    tiny="$(mktemp -d)"
+    trap 'rm -rf "$tiny"' EXIT
+    step bash baselines/run_all.sh --tiny --output "$tiny"
+    test -s "$tiny/index.html"
+fi
 step "$PYTHON" -m pytest "${markers[@]}" "$@"

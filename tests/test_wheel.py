@@ -1,0 +1,83 @@
+"""The wheel: what it holds, and that it works from any folder once it is installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EPISODE = """
+import gymnasium as gym, numpy as np, tslam_bench
+env = gym.make("TactileSLAM-v0", object="mug", pose=0)
+observation, _ = env.reset(seed=0)
+observation, reward, *_ = env.step(np.zeros(28, dtype=np.float32))
+print("STEPPED", tuple(observation["occupancy"].shape), tslam_bench.__file__)
+"""
+pytestmark = pytest.mark.slow
+
+
+def run(*command: object, folder: Path) -> str:
+    """Standard output of a command that must succeed."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "pip", "wheel", ROOT, "--no-deps", "--quiet", "--wheel-dir", folder, folder=folder)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Interpreter of a new virtual environment that holds the wheel; its dependencies are those of this environment."""
+    folder = tmp_path_factory.mktemp("environment")
+    run(sys.executable, "-m", "venv", folder, folder=folder)
+    python = folder / "bin" / "python"
+    run(python, "-m", "pip", "install", "--quiet", "--no-deps", wheel, folder=folder)
+    site = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", folder=folder).strip())
+    # A folder named in a .pth file is searched, but the .pth files in it (our editable install) are not read.
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    return python
+
+
+def test_the_wheel_holds_every_module_and_nothing_with_a_generic_name(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"tslam_bench"}
+    for folder in ("tslam_bench", "tasks", "baselines", "leaderboard"):
+        inside = "" if folder == "tslam_bench" else "tslam_bench/"
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".jinja", ".css", ".html", ".sh", ".typed"):
+                assert inside + path.relative_to(ROOT).as_posix() in names
+    for split in ("test", "train", "val"):
+        assert f"tslam_bench/assets/manifest_{split}.json" in names
+
+
+@pytest.mark.parametrize("inside_the_clone", [False, True])
+def test_an_installed_wheel_makes_an_environment(installed: Path, tmp_path: Path, inside_the_clone: bool) -> None:
+    output = run(installed, "-c", EPISODE, folder=ROOT if inside_the_clone else tmp_path)
+    assert "STEPPED (1, 2, 32, 32, 32)" in output
+    # In the clone's root Python finds the clone's package first; elsewhere the installed one.
+    assert (str(ROOT / "tslam_bench") in output) == inside_the_clone
+
+
+def test_an_installed_wheel_evaluates_and_scores(installed: Path, tmp_path: Path) -> None:
+    command = installed.parent / "tslam-bench"
+    options = ["--objects", "mug", "--reconstructor", "grid", "--output", tmp_path / "run"]
+    run(command, "evaluate", "--policy", "random", *options, folder=tmp_path)
+    submission = tmp_path / "run" / "submissions" / "random-grid"
+    assert "mug" in run(command, "score", submission, "--objects", "mug", folder=tmp_path)
+    run(command, "leaderboard", submission, "--output", tmp_path / "page", folder=tmp_path)
+    assert (tmp_path / "page" / "index.html").stat().st_size > 10_000

@@ -140,14 +140,15 @@ def _evaluate(arguments: list[str]) -> None:
     spec = get_baseline(parsed.baseline)
     import torch
 
-    from tslam_bench.evaluation.evaluate import EvaluationConfig, default_objects, evaluate, make_reconstructors
+    from tslam_bench.evaluation.evaluate import EvaluationConfig, evaluate, make_reconstructors
+    from tslam_bench.objects.splits import object_set
 
     if parsed.torch_threads < 1:
         raise InvalidInputError(f"torch_threads {parsed.torch_threads}: must be at least 1")
     torch.set_num_threads(parsed.torch_threads)
     config = EvaluationConfig(
         baseline=spec.id,
-        objects=parsed.objects or default_objects(parsed.object_set),
+        objects=parsed.objects or object_set(parsed.object_set),
         seeds=parsed.seeds,
         object_set=parsed.object_set,
         model=parsed.model,

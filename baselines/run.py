@@ -24,7 +24,8 @@ from tslam_bench.episodes import check_salt
 from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.evaluation.jobs import Job, JobRunner
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline, list_baselines
-from tslam_bench.objects.store import asset_sha256, known_names, list_objects
+from tslam_bench.objects.splits import known_names
+from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.reconstruction.registry import get_reconstructor
 from tslam_bench.scoring.submission import INFO_FILE
 

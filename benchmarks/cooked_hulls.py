@@ -15,7 +15,8 @@ from rich.table import Table
 from scipy.spatial import ConvexHull
 
 from tslam_bench.engine.physics import collision_shapes
-from tslam_bench.objects.store import PreparedObject, check_split, load_object, prepared_names
+from tslam_bench.objects.splits import check_split, prepared_names
+from tslam_bench.objects.store import PreparedObject, load_object
 
 
 @dataclass(frozen=True)

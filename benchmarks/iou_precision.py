@@ -22,7 +22,8 @@ from tslam_bench.errors import BenchmarkError
 from tslam_bench.geometry.distance import InsideTest
 from tslam_bench.geometry.meshes import TriangleMesh
 from tslam_bench.geometry.sampling import iou_points
-from tslam_bench.objects.store import PreparedObject, known_names, load_object
+from tslam_bench.objects.splits import known_names
+from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.scoring.metrics import iou
 
 SHIFT = 4e-3

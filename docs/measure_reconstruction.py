@@ -28,7 +28,8 @@ from tslam_bench.constants import (
 )
 from tslam_bench.errors import BenchmarkError
 from tslam_bench.geometry.sampling import iou_points
-from tslam_bench.objects.store import PreparedObject, load_object, prepared_names
+from tslam_bench.objects.splits import prepared_names
+from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import make_reconstructor

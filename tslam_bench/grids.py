@@ -41,8 +41,11 @@ def pose_rotation(pose: int) -> NDArray[np.int64]:
     return yaw @ flip
 
 
-def _turn(grid: NDArray, rotation: NDArray[np.int64]) -> NDArray:
-    """Moves every voxel of ``grid`` (..., N, N, N) to where ``rotation`` takes its centre."""
+def turn(grid: NDArray, rotation: NDArray[np.int64]) -> NDArray:
+    """Moves every voxel of ``grid`` (..., N, N, N) to where ``rotation`` takes its centre.
+
+    ``rotation`` (3, 3) is a signed permutation.
+    """
     lead = grid.ndim - 3
     source_axis = np.abs(rotation).argmax(axis=1)  # output axis a reads input axis source_axis[a]
     turned = grid.transpose(*range(lead), *(lead + source_axis))
@@ -52,12 +55,12 @@ def _turn(grid: NDArray, rotation: NDArray[np.int64]) -> NDArray:
 
 def object_to_world(grid: NDArray, pose: int) -> NDArray:
     """Grid (..., 32, 32, 32) in the object frame -> the same solid in the world frame for an object in ``pose``."""
-    return np.ascontiguousarray(_turn(grid, pose_rotation(pose)))
+    return np.ascontiguousarray(turn(grid, pose_rotation(pose)))
 
 
 def world_to_object(grid: NDArray, pose: int) -> NDArray:
     """Grid (..., 32, 32, 32) sensed in the world frame -> object frame. Inverse of :func:`object_to_world`."""
-    return np.ascontiguousarray(_turn(grid, pose_rotation(pose).T))
+    return np.ascontiguousarray(turn(grid, pose_rotation(pose).T))
 
 
 def merge(grids: Iterable[NDArray]) -> NDArray[np.bool_]:

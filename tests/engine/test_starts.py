@@ -9,10 +9,10 @@ from tslam_bench.engine.skin import build_skin
 from tslam_bench.engine.starts import StartSampler
 from tslam_bench.episodes import episode_seed
 from tslam_bench.hand_constants import START_ARM_HIGH, START_ARM_LOW
-from tslam_bench.objects import splits, store
+from tslam_bench.objects import splits
 from tslam_bench.objects.hand import load_hand
 
-PREPARED = [name for name in splits.OBJECTS if name in store.prepared_names("test")]
+PREPARED = [name for name in splits.OBJECTS if name in splits.prepared_names("test")]
 """All 50 test objects where the whole split is prepared; the quick ones and a few more on a fresh machine."""
 
 
@@ -56,6 +56,6 @@ def test_the_start_box_is_clear_of_everything_that_the_gates_allow():
 def test_objects_are_found_in_whatever_split_has_them():
     sampler = StartSampler(None, ["mug"], None)
     assert sampler.load("mug").split == "test" and sampler.load("coffeemug").name == "mug"
-    train = store.prepared_names("train")
+    train = splits.prepared_names("train")
     if train:
         assert sampler.load(train[0]).split == "train"

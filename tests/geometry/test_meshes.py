@@ -6,8 +6,9 @@ import trimesh
 from manifold3d import Manifold
 
 from tslam_bench.errors import AssetError
-from tslam_bench.geometry.distance import InsideTest, contains, distance_to_mesh, sample_surface
+from tslam_bench.geometry.distance import InsideTest, contains, distance_to_mesh
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, parse_stl, simplify, to_manifold
+from tslam_bench.geometry.sampling import sample_surface
 from tslam_bench.geometry.scanline import inside_grid
 from tslam_bench.sources.generator import generate
 

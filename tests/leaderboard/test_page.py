@@ -453,7 +453,7 @@ def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path:
     with pytest.raises(AssetError, match="assets prepare"):
         page_main([str(run / "submissions" / "mine-hull"), "--output", str(tmp_path)])
     assert not (tmp_path / "index.html").exists()
-    monkeypatch.setattr("tslam_bench.scoring.scoring.QUICK_OBJECTS", NAMES)
+    monkeypatch.setattr("tslam_bench.objects.splits.QUICK_OBJECTS", NAMES)
     page_main([str(run / "submissions" / "mine-hull"), "--output", str(tmp_path), "--pictured", "0"])
     assert json.loads((tmp_path / "leaderboard.json").read_text())["tables"][0]["object_set"] == "quick"
 

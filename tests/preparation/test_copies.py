@@ -8,10 +8,10 @@ from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
-from tslam_bench.objects import store
+from tslam_bench.objects import splits
 from tslam_bench.preparation import copies, schedule
-from tslam_bench.preparation.pipeline import SourceMesh
 from tslam_bench.sources.generator import generate
+from tslam_bench.sources.source import SourceMesh
 
 
 def turned(mesh: TriangleMesh, factor: float, seed: int | None = None) -> TriangleMesh:
@@ -95,8 +95,8 @@ def test_copies_are_dropped_and_remembered(tmp_path):
         "carton-001": "prepared",
     }
     assert "copy of train/book-000" in final[copy.name].message
-    assert store.prepared_names("train", tmp_path) == ["book-000", "carton-001", "dumbbell-000"]
-    assert store.prepared_names("val", tmp_path) == []
+    assert splits.prepared_names("train", tmp_path) == ["book-000", "carton-001", "dumbbell-000"]
+    assert splits.prepared_names("val", tmp_path) == []
 
     again = {o.name: o for o in schedule.prepare_distinct([copy, book], cache=tmp_path)}
     assert again[copy.name].status == "rejected"

@@ -6,7 +6,9 @@ import pytest
 from manifold3d import Manifold
 
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
+from tslam_bench.geometry.interpolation import trilinear
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
+from tslam_bench.objects.store import SignedDistanceField
 from tslam_bench.preparation import decompose, field
 
 HALF = np.array([0.03, 0.02, 0.01])
@@ -25,6 +27,10 @@ def split_box() -> list[TriangleMesh]:
     return [from_manifold(left), from_manifold(right)]
 
 
+def read(field: SignedDistanceField, points: np.ndarray) -> np.ndarray:
+    return trilinear(field.values, field.origin, field.spacing, points)
+
+
 @pytest.fixture(scope="module")
 def box_field():
     return field.build_field(split_box())
@@ -41,19 +47,19 @@ def test_field_of_the_box(box_field):
     generator = np.random.default_rng(1)
     points = generator.uniform(-HALF - 0.015, HALF + 0.015, (20_000, 3))
     exact = box_distance(points, HALF)
-    read = field.trilinear(box_field, points)
+    values = read(box_field, points)
     outside = exact > -5e-4
-    assert np.abs(read - exact)[outside].max() < 2 * SIGNED_DISTANCE_TOLERANCE
-    assert np.quantile(np.abs(read - exact)[outside], 0.99) < 0.3e-3
+    assert np.abs(values - exact)[outside].max() < 2 * SIGNED_DISTANCE_TOLERANCE
+    assert np.quantile(np.abs(values - exact)[outside], 0.99) < 0.3e-3
     # Deep inside, where the halves meet, nothing reads as surface.
-    assert read[exact < -2e-3].max() < -1e-3
+    assert values[exact < -2e-3].max() < -1e-3
     # Touch compares with 1 mm: on the surface the field is within tolerance.
     on_surface = points.copy()
     axis = generator.integers(3, size=len(points))
     rows = np.arange(len(points))
     on_surface = np.clip(on_surface, -HALF, HALF)
     on_surface[rows, axis] = np.sign(on_surface[rows, axis]) * HALF[axis]
-    assert np.abs(field.trilinear(box_field, on_surface)).max() <= SIGNED_DISTANCE_TOLERANCE
+    assert np.abs(read(box_field, on_surface)).max() <= SIGNED_DISTANCE_TOLERANCE
     assert box_field.surface_error <= SIGNED_DISTANCE_TOLERANCE
 
 
@@ -61,10 +67,7 @@ def test_gradient_points_away_from_the_surface(box_field):
     points = np.array([[0.04, 0.0, 0.0], [0.0, -0.03, 0.0], [0.0, 0.0, 0.018]])
     step = 0.5 * box_field.spacing
     gradient = np.stack(
-        [
-            (field.trilinear(box_field, points + step * e) - field.trilinear(box_field, points - step * e)) / (2 * step)
-            for e in np.eye(3)
-        ],
+        [(read(box_field, points + step * e) - read(box_field, points - step * e)) / (2 * step) for e in np.eye(3)],
         axis=1,
     )
     np.testing.assert_allclose(gradient, np.sign(points), atol=0.03)
@@ -86,7 +89,7 @@ def test_field_of_a_thin_wall_agrees_with_libigl():
     points = np.random.default_rng(2).uniform(-0.035, 0.035, (20_000, 3))
     exact = igl.signed_distance(points, surface.vertices, surface.faces)[0]
     near = (exact > 0) & (exact < 0.003)
-    error = np.abs(field.trilinear(built, points) - exact)
+    error = np.abs(read(built, points) - exact)
     assert built.surface_error <= SIGNED_DISTANCE_TOLERANCE
     assert np.quantile(error[near], 0.95) < 0.3e-3
-    assert (field.trilinear(built, points)[exact < -4e-4] < 0).mean() > 0.95
+    assert (read(built, points)[exact < -4e-4] < 0).mean() > 0.95

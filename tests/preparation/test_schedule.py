@@ -14,10 +14,11 @@ import trimesh
 from tslam_bench.cli import assets
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
+from tslam_bench.files import package_data
 from tslam_bench.geometry.distance import contains
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
 from tslam_bench.objects import splits, store
-from tslam_bench.preparation import pipeline, repair, schedule
+from tslam_bench.preparation import manifest, pipeline, repair, schedule
 from tslam_bench.preparation import rejections as rejections_module
 from tslam_bench.preparation.pipeline import GateError, check_gates, check_size, parameters_sha256
 from tslam_bench.sources import contactdb
@@ -73,26 +74,29 @@ def test_a_broken_file_is_named_and_rebuilt(cache, harm):
     assert path.read_bytes() == original  # and the rebuilt file has the same bytes
 
 
-def test_manifest_holds_the_records(cache):
-    manifest = json.loads((cache / "manifest-train.json").read_text())
-    assert [record["name"] for record in manifest["objects"]] == ["book-000", "carton-001"]
-    assert manifest["objects"] == store.list_objects("train", cache)
-
-
-def test_a_reference_manifest_is_short_and_says_the_same(cache, tmp_path):
-    path = schedule.write_manifest("train", tmp_path / "reference.json", cache)
-    manifest = json.loads(path.read_text())
-    full = store.list_objects("train", cache)
+def test_a_manifest_is_short_and_says_what_the_records_say(cache):
+    path = cache / "manifest-train.json"
+    content, full = manifest.read(path), store.list_objects("train", cache)
+    assert [short["name"] for short in content["objects"]] == ["book-000", "carton-001"]
     assert len(path.read_text().splitlines()) < 20
-    for short, record in zip(manifest["objects"], full, strict=True):
-        assert short["bytes"] == sum(
-            p.stat().st_size for p in store.object_directory(short["name"], "train", cache).glob("*.npy")
-        )
-        assert {key: record[key] for key in short if key in record} == {
-            key: short[key] for key in short if key in record
+    for short, record in zip(content["objects"], full, strict=True):
+        files = list(store.object_directory(short["name"], "train", cache).glob("*.npy"))
+        assert short["bytes"] == sum(path.stat().st_size for path in files)
+        assert {key: short[key] for key in short if key in record} == {
+            key: record[key] for key in short if key in record
         }
-    assert manifest["rejected"] == {}
-    assert len({short["products_sha256"] for short in manifest["objects"]}) == len(full)
+    assert content["rejected"] == {}
+    assert len({short["products_sha256"] for short in content["objects"]}) == len(full)
+
+
+def test_objects_have_the_bytes_of_the_reference_manifest(cache):
+    """Prepared here, from nothing but the seeds: what was prepared for the manifest that comes with the package."""
+    known = {
+        record["name"]: record for record in manifest.read(package_data("assets", "manifest_train.json"))["objects"]
+    }
+    for made in manifest.read(cache / "manifest-train.json")["objects"]:
+        if made["name"] in known and known[made["name"]]["format"] == store.FORMAT:
+            assert made["products_sha256"] == known[made["name"]]["products_sha256"]
 
 
 @dataclasses.dataclass(frozen=True)

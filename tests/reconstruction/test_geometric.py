@@ -17,7 +17,7 @@ from tslam_bench.reconstruction.carve import CarveReconstructor, carved_voxels
 from tslam_bench.reconstruction.grid import GridReconstructor
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.inputs import read_grids
-from tslam_bench.reconstruction.priors import MeanShapeReconstructor, RetrievalReconstructor, turn_grid
+from tslam_bench.reconstruction.priors import MeanShapeReconstructor, RetrievalReconstructor
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.training_shapes import axis_rotations
 from tslam_bench.scoring.metrics import iou
@@ -300,7 +300,7 @@ def test_turned_grids_follow_their_voxel_centres():
     grid = random_touches(8, 50)
     for rotation in axis_rotations():
         moved = grids.points_to_grid(grids.voxel_centres()[grid] @ rotation.T)
-        assert np.array_equal(turn_grid(grid, rotation), moved)
+        assert np.array_equal(grids.turn(grid, rotation), moved)
 
 
 def test_mean_shape_is_the_best_level_of_the_mean(library):
@@ -323,7 +323,7 @@ def test_mean_shape_of_one_object_is_that_object(library):
 def test_retrieval_finds_the_shape_however_it_is_turned(library, index):
     generator = np.random.default_rng(index)
     for rotation in axis_rotations():
-        surface, solid = (turn_grid(grid[index], rotation) for grid in (library[1], library[0]))
+        surface, solid = (grids.turn(grid[index], rotation) for grid in (library[1], library[0]))
         touched = surface & (generator.random(surface.shape) < 0.15)
         visited = ~solid & (generator.random(surface.shape) < 0.5)
         volume = RetrievalReconstructor(*library).reconstruct(touched, visited)

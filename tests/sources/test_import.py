@@ -19,7 +19,7 @@ import tslam_bench
 from tslam_bench.cli import assets
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.objects import store
+from tslam_bench.objects import splits, store
 from tslam_bench.objects.hand import hand_directory, load_hand
 from tslam_bench.preparation.schedule import remove_unlisted
 from tslam_bench.preparation.workers import WorkerPool
@@ -443,9 +443,9 @@ def test_a_private_set_from_files_to_touch(tmp_path, monkeypatch, capsys):
     manifest.write_text(json.dumps({"split": "mine", "license": "ours", "source": "lab", "objects": entries[:1]}))
     capsys.readouterr()
     assets.main(["prepare", "--manifest", str(manifest), "--objects", "carton", "--workers", "1"])
-    assert store.prepared_names("mine") == ["bracket", "carton"]  # a part of the manifest removes nothing
+    assert splits.prepared_names("mine") == ["bracket", "carton"]  # a part of the manifest removes nothing
     assets.main(["prepare", "--manifest", str(manifest), "--workers", "1"])
-    assert store.prepared_names("mine") == ["carton"]
+    assert splits.prepared_names("mine") == ["carton"]
     assert "bracket: no longer in" in capsys.readouterr().out
 
 

@@ -30,8 +30,8 @@ from tslam_bench.hand_constants import (
     JOINT_LIMITS,
     SKIN_LINKS,
 )
-from tslam_bench.objects.splits import OBJECTS
-from tslam_bench.objects.store import load_object, prepared_names
+from tslam_bench.objects.splits import OBJECTS, prepared_names
+from tslam_bench.objects.store import load_object
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from penetration import pressing_audits

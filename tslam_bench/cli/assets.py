@@ -16,19 +16,10 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from tslam_bench.constants import DEFAULT_SPLIT, QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
+from tslam_bench.constants import DEFAULT_SPLIT
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, write_json
 from tslam_bench.objects import splits, store
-
-QUICK = {"test": QUICK_OBJECTS, "train": QUICK_TRAIN_OBJECTS, "val": QUICK_VAL_OBJECTS}
-"""Objects of the quick set-up."""
-FULL_GENERATED = {"train": 600, "val": 60}
-"""Objects of a set that is generated only."""
-FURNITURE_PER_CATEGORY = 15
-"""Real models that one category gives the default set, so that chairs and tables do not fill it."""
-ADDED_ROUNDS = {"train": 5, "val": 5}
-"""Generated objects per category that the default set has beside the real ones."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +52,7 @@ class Prepare:
     recheck: bool = False
     """Try the objects again that were rejected before, here or when the default sets were made."""
     write_manifest: Path | None = None
-    """Also write the split's manifest to this file (of train and val: one line per object)."""
+    """Also write the split's manifest to this file (one line per object)."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +152,7 @@ def _check_workers(workers: int, time_limit: float) -> None:
 
 def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
     """Split, what to prepare of it, and how many of that (None: all)."""
-    from tslam_bench.preparation.decompose import settings_for
-    from tslam_bench.preparation.schedule import ContactDBSource
+    from tslam_bench.preparation.selection import select_test, select_training
 
     _check_workers(command.workers, command.time_limit)
     if command.manifest is not None:
@@ -174,58 +164,22 @@ def _sources(command: Prepare) -> tuple[str, list[Any], int | None]:
             raise InvalidInputError(f"object {unknown[0]!r}: not in {command.manifest}")
         return split, [source for source in own if not command.objects or source.name in command.objects], None
     asked = command.split or "test"
-    split = store.SPLIT_ALIASES.get(asked, asked)
-    if split not in store.SPLITS:
+    split = splits.SPLIT_ALIASES.get(asked, asked)
+    if split not in splits.SPLITS:
         raise InvalidInputError(
-            f"split {command.split!r}: unknown; choose one of {', '.join(store.SPLITS)}, or use --manifest or import"
+            f"split {command.split!r}: unknown; choose one of {', '.join(splits.SPLITS)}, or use --manifest or import"
         )
     if command.count is not None and command.count < 1:
         raise InvalidInputError(f"--count {command.count}: must be at least 1")
     if split == "test":
         if command.source != "all" or command.count is not None:
             raise InvalidInputError("--source, --count: the test split is fixed; --objects NAME ... takes a part of it")
-        names = command.objects or (QUICK["test"] if command.quick else tuple(splits.OBJECTS))
-        resolved = dict.fromkeys(store.resolve_name(name, "test") for name in names)
-        # Those that take longest go first, so that no worker is left alone with one in the end.
-        longest_first = sorted(resolved, key=lambda name: -settings_for("test", name).max_hulls)
-        return split, [ContactDBSource(name) for name in longest_first], None
-    if command.quick and not command.objects and command.count is None:
-        command = replace(command, objects=QUICK[split])
-    generated, real = _training_sources(command, split)
-    if command.objects:
-        by_name = {source.name: source for source in [*generated, *real]}
-        unknown = [name for name in command.objects if name not in by_name]
-        if unknown:
-            raise InvalidInputError(f"object {unknown[0]!r}: not in split {split} (source: {command.source})")
-        return split, [by_name[name] for name in command.objects], None
-    if command.quick:
-        return split, generated, command.count
-    if command.source == "generated":
-        return split, generated, command.count or FULL_GENERATED[split]
-    return split, [*real, *generated], command.count
-
-
-def _training_sources(command: Prepare, split: str) -> tuple[list[Any], list[Any]]:
-    """Generated and real sources of train or val."""
-    from tslam_bench.sources import sweethome3d
-    from tslam_bench.sources.generator import generate
-
-    generated: list[Any] = []
-    real: list[Any] = []
-    only_generated = command.quick or command.source == "generated"
-    if command.source != "furniture":
-        generated = list(
-            generate.candidates(split, rounds=200 if only_generated or command.objects else ADDED_ROUNDS[split])
+        chosen = select_test(command.objects, command.quick)
+    else:
+        chosen = select_training(
+            split, command.objects, command.quick, command.source, command.count, cache_directory()
         )
-    if not only_generated and not _all_known(command.objects, generated):
-        limit = FURNITURE_PER_CATEGORY if command.source == "all" and not command.objects else None
-        real = sweethome3d.furniture(split, cache_directory(), limit)
-    return generated, real
-
-
-def _all_known(names: tuple[str, ...], sources: list[Any]) -> bool:
-    """Whether there are names and all of them are among ``sources``: then nothing else has to be fetched."""
-    return bool(names) and set(names) <= {source.name for source in sources}
+    return split, list(chosen.sources), chosen.count
 
 
 def _show_progress(
@@ -339,7 +293,7 @@ def _list(command: List) -> None:
         print(json.dumps(records, indent=2, sort_keys=True))
         return
     if not records:
-        split = store.check_split(command.split)
+        split = splits.check_split(command.split)
         print(f"no object of split {split} is prepared; run: tslam-bench assets prepare --split {split}")
         return
     table = Table(box=None, pad_edge=False)
@@ -378,10 +332,10 @@ def _show(command: Show) -> None:
 
 
 def _verify(command: Verify) -> None:
-    splits = [store.check_split(command.split)] if command.split else [*store.SPLITS]
+    checked = [splits.check_split(command.split)] if command.split else [*splits.SPLITS]
     lines, count = [], 0
-    for split in splits:
-        for name in tqdm(store.prepared_names(split), unit="object", desc=f"verifying {split}", dynamic_ncols=True):
+    for split in checked:
+        for name in tqdm(splits.prepared_names(split), unit="object", desc=f"verifying {split}", dynamic_ncols=True):
             count += 1
             lines += store.damage(name, split)
     for line in lines:

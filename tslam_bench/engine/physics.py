@@ -14,6 +14,7 @@ from sapien import physx
 from tslam_bench import grids
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS, TABLE_SIZE
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.geometry.triangles import face_normals
 from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT
 from tslam_bench.objects.store import PreparedObject
 
@@ -192,15 +193,13 @@ def _looks(prepared: PreparedObject) -> Any:
     material = sapien.render.RenderMaterial(base_color=[0.90, 0.56, 0.25, 1.0], roughness=0.6, specular=0.3)
     corners = np.asarray(prepared.vertices[prepared.faces].reshape(-1, 3), dtype=np.float32)
     triangles = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    edges = corners.reshape(-1, 3, 3)
-    normal = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normals = face_normals(corners.reshape(-1, 3, 3))
     component = sapien.render.RenderBodyComponent()
     component.attach(
         sapien.render.RenderShapeTriangleMesh(
             corners,
             triangles,
-            np.repeat(normal, 3, axis=0).astype(np.float32),
+            np.repeat(normals, 3, axis=0).astype(np.float32),
             np.zeros((len(corners), 2), dtype=np.float32),
             material,
         )

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from tslam_bench.constants import DEFAULT_SPLIT, NUM_JOINTS, TRAIN_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_LIMITS, START_ARM_HIGH, START_ARM_LOW, START_FINGER_NOISE
-from tslam_bench.objects.store import PreparedObject, find_split, list_objects, load_object, read_record, resolve_name
+from tslam_bench.objects.splits import find_split, resolve_name
+from tslam_bench.objects.store import PreparedObject, list_objects, load_object, read_record
 from tslam_bench.variants import FREE, Variant
 
 LOADED_OBJECTS: Final = 64

@@ -20,7 +20,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES
 from tslam_bench.episodes import check_salt, new_salt, shuffled
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, BaselineSpec, get_baseline, make_baseline
@@ -28,7 +28,8 @@ from tslam_bench.evaluation.rollouts import Rollout, roll_out_batch
 from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import CONTROL_MODES
-from tslam_bench.objects.store import asset_sha256, known_names, load_object, resolve_name
+from tslam_bench.objects.splits import object_set, resolve_name
+from tslam_bench.objects.store import asset_sha256, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.registration import make_vec
@@ -80,11 +81,6 @@ class EvaluationConfig:
         if min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError(f"seeds {list(self.seeds)}: must be different and not negative")
         object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name) for name in self.objects)))
-
-
-def default_objects(object_set: str) -> tuple[str, ...]:
-    """Objects of an object set: the five quick ones, or the test split."""
-    return QUICK_OBJECTS if object_set == "quick" else tuple(known_names("test"))
 
 
 def make_reconstructors(
@@ -221,7 +217,7 @@ def manifest_sha256(config: EvaluationConfig) -> str:
         AssetError: an evaluated object is not prepared.
     """
     try:
-        return asset_sha256(default_objects(config.object_set))
+        return asset_sha256(object_set(config.object_set))
     except AssetError:
         return asset_sha256(config.objects)
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
+from tslam_bench.geometry import triangles
+
 ALPHA_RADIUS: Final = 0.03
 """Tetrahedra with a circumradius above this (m) are left out of the shape."""
 MAX_POINTS: Final = 192
@@ -55,15 +57,13 @@ def alpha_shape_triangles(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def alpha_shape_samples(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(SAMPLES, 3) low-discrepancy samples on the alpha shape of (m, 3) thinned points; the points while it is empty."""
-    triangles = alpha_shape_triangles(points)
-    area = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    corners = alpha_shape_triangles(points)
+    area = triangles.areas(corners)
     if area.sum() <= 0:
         return points
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES * area.sum()
     chosen = np.minimum(np.searchsorted(np.cumsum(area), share), len(area) - 1)
-    u, v = np.sqrt(_SOBOL_LIKE[:, :1]), _SOBOL_LIKE[:, 1:]
-    a, b, c = triangles[chosen, 0], triangles[chosen, 1], triangles[chosen, 2]
-    return (1 - u) * a + u * (1 - v) * b + u * v * c
+    return triangles.points_on(corners[chosen], _SOBOL_LIKE[:, :1], _SOBOL_LIKE[:, 1:])
 
 
 def chamfer_l2(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -67,18 +67,3 @@ class InsideTest:
         near = ~self._clear[cell]
         inside[near] = contains(points[near], self._mesh)
         return inside
-
-
-def sample_surface(
-    mesh: TriangleMesh, count: int, generator: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Area-uniform samples: points (count, 3) and the face each lies on (count,)."""
-    a, b, c = mesh.triangles().transpose(1, 0, 2)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    cumulative = np.cumsum(area)
-    face = np.searchsorted(cumulative, generator.random(count) * cumulative[-1], side="right")
-    face = np.minimum(face, len(area) - 1)
-    u, v = generator.random((2, count, 1))
-    root = np.sqrt(u)
-    points = (1 - root) * a[face] + root * (1 - v) * b[face] + root * v * c[face]
-    return points, face

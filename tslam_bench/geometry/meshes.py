@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tslam_bench.errors import AssetError
+from tslam_bench.geometry import triangles
 
 
 class TriangleMesh(NamedTuple):
@@ -43,10 +44,11 @@ class TriangleMesh(NamedTuple):
 
     def face_normals(self) -> NDArray[np.float64]:
         """(F, 3) unit normals, zero for degenerate faces."""
-        a, b, c = self.triangles().transpose(1, 0, 2)
-        normals = np.cross(b - a, c - a)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+        return triangles.face_normals(self.triangles())
+
+    def area(self) -> float:
+        """Area of the surface."""
+        return float(triangles.areas(self.triangles()).sum())
 
 
 def parse_stl(data: bytes) -> TriangleMesh:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_LOW
+from tslam_bench.geometry.triangles import face_normals
 
 Colour = tuple[float, float, float]
 """sRGB, each channel in [0, 1]."""
@@ -174,8 +175,7 @@ class _Scene:
         self._colour = _decode(np.repeat([tint for _, tint in items], [len(mesh.faces) for mesh in meshes], axis=0))
         corners = [mesh.vertex_normals[mesh.faces] for mesh in meshes]
         self._triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in meshes])
-        cross = np.cross(self._triangles[:, 1] - self._triangles[:, 0], self._triangles[:, 2] - self._triangles[:, 0])
-        self._normal = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+        self._normal = face_normals(self._triangles)
         smooth = np.concatenate(corners)
         sharp = np.einsum("fci,fi->fc", smooth, self._normal) < _CREASE
         self._corner = np.where(sharp[..., None], self._normal[:, None], smooth)

@@ -1,4 +1,4 @@
-"""The test split: the 50 distinct objects of ContactDB, their aliases, what is left out and why.
+"""Splits and the names of their objects. The test split is a table: the 50 distinct objects of ContactDB.
 
 ContactDB: S. Brahmbhatt, C. Ham, C. C. Kemp and J. Hays, "ContactDB: Analyzing and predicting grasp contact via thermal
 imaging", CVPR 2019.
@@ -6,7 +6,18 @@ imaging", CVPR 2019.
 
 from __future__ import annotations
 
+import difflib
+import re
 from dataclasses import dataclass
+from pathlib import Path
+
+from tslam_bench.constants import QUICK_OBJECTS
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.files import cache_directory
+
+SPLITS = ("test", "train", "val")
+"""The benchmark's own splits; an organiser may add others."""
+SPLIT_ALIASES = {"contactdb50": "test"}
 
 
 @dataclass(frozen=True)
@@ -99,3 +110,85 @@ EXCLUDED: dict[str, str] = {
 
 PAPER60: tuple[str, ...] = tuple(sorted([*OBJECTS, *ALIASES, *EXCLUDED]))
 """The paper's 60 names: 50 objects, 5 duplicates, and the 5 that are excluded. For comparison only."""
+
+
+def object_set(name: str) -> tuple[str, ...]:
+    """Objects of a ranking: the five of the quick run (``quick``), or the whole test split."""
+    return QUICK_OBJECTS if name == "quick" else tuple(sorted(OBJECTS))
+
+
+def check_split(split: str, cache: Path | None = None) -> str:
+    """Canonical name of a split. Raises InvalidInputError unless it is ours or prepared in the cache."""
+    resolved = SPLIT_ALIASES.get(split, split)
+    root = (cache or cache_directory()) / "objects"
+    if resolved in SPLITS or (re.fullmatch(r"[A-Za-z0-9_-]+", resolved) and (root / resolved).is_dir()):
+        return resolved
+    known = sorted({*SPLITS, *SPLIT_ALIASES})
+    raise InvalidInputError(f"split {split!r}: unknown{_suggest(split, known)}; choose one of {', '.join(known)}")
+
+
+def split_directory(split: str, cache: Path | None = None) -> Path:
+    """Directory of a split's objects (may not exist)."""
+    return (cache or cache_directory()) / "objects" / split
+
+
+def prepared_names(split: str, cache: Path | None = None) -> list[str]:
+    """Names of the objects that a split's directory holds, sorted."""
+    directory = split_directory(split, cache)
+    if not directory.is_dir():
+        return []
+    return sorted(path.parent.name for path in directory.glob("[!.]*/record.json"))
+
+
+def known_names(split: str, cache: Path | None = None) -> list[str]:
+    """Names (without aliases) of a split: the definition's for ``test``, what is prepared for the others; sorted."""
+    return sorted(OBJECTS) if split == "test" else prepared_names(split, cache)
+
+
+def _suggest(name: str, known: list[str]) -> str:
+    """ " (did you mean ...?)" when there are near matches."""
+    near = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.5)
+    return f" (did you mean {' or '.join(near)}?)" if near else ""
+
+
+def resolve_name(name: str, split: str = "test", cache: Path | None = None) -> str:
+    """The object that ``name``, which may be an alias, stands for in a canonical split.
+
+    Raises:
+        InvalidInputError: there is no such object; the message lists near matches.
+    """
+    if split == "test":
+        if name in ALIASES:
+            return ALIASES[name]
+        if name in EXCLUDED:
+            raise InvalidInputError(f"object {name!r}: left out of split test: {EXCLUDED[name]}")
+    known = known_names(split, cache)
+    if name in known:
+        return name
+    if not known:
+        raise AssetError(
+            f"object {name!r}: split {split} is not prepared; run: tslam-bench assets prepare --split {split}"
+        )
+    candidates = [*known, *ALIASES] if split == "test" else known
+    raise InvalidInputError(
+        f"object {name!r}: unknown in split {split}{_suggest(name, candidates)}; "
+        f"see: tslam-bench assets list --split {split}"
+    )
+
+
+def find_split(name: str, cache: Path | None = None) -> str:
+    """The benchmark's split that has an object of this name (or alias): test, train or val.
+
+    Raises:
+        InvalidInputError: none has; the message lists near matches.
+    """
+    for split in SPLITS:
+        if name in known_names(split, cache) or (split == "test" and name in ALIASES):
+            return split
+    if name in EXCLUDED:
+        return "test"  # whoever loads it learns why it is left out
+    candidates = [known for split in SPLITS for known in known_names(split, cache)]
+    raise InvalidInputError(
+        f"object {name!r}: unknown in the splits {', '.join(SPLITS)}{_suggest(name, [*candidates, *ALIASES])}; "
+        "see: tslam-bench assets list --split SPLIT"
+    )

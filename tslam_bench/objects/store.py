@@ -7,11 +7,8 @@ metres. numpy only.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import itertools
 import json
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,17 +19,16 @@ from numpy.typing import NDArray
 
 from tslam_bench.constants import SURFACE_SAMPLES
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_directory, cache_directory, sha256_file, write_json
+from tslam_bench.files import atomic_directory, sha256_file, write_json
 from tslam_bench.geometry.sampling import IouPoints, iou_points
+from tslam_bench.geometry.triangles import face_normals
 from tslam_bench.grids import pack, unpack
 from tslam_bench.objects import splits
+from tslam_bench.objects.hulls import Hull, pack_hulls, unpack_hulls
+from tslam_bench.objects.splits import check_split, prepared_names, resolve_name, split_directory
 
 FORMAT = 2
 """Version of the directory layout."""
-SPLITS = ("test", "train", "val")
-"""The benchmark's own splits; an organiser may add others."""
-SPLIT_ALIASES = {"contactdb50": "test"}
-
 ARRAYS = (
     "vertices",
     "faces",
@@ -90,7 +86,7 @@ class PreparedObject:
     category: str
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
-    hulls: tuple[tuple[NDArray[np.float64], NDArray[np.int64]], ...]
+    hulls: tuple[Hull, ...]
     field: SignedDistanceField
     solid: NDArray[np.bool_]
     surface: NDArray[np.bool_]
@@ -106,21 +102,6 @@ class PreparedObject:
         return iou_points(self.vertices.min(axis=0), self.vertices.max(axis=0), self.iou_cells)
 
 
-def check_split(split: str, cache: Path | None = None) -> str:
-    """Canonical name of a split. Raises InvalidInputError unless it is ours or prepared in the cache."""
-    resolved = SPLIT_ALIASES.get(split, split)
-    root = (cache or cache_directory()) / "objects"
-    if resolved in SPLITS or (re.fullmatch(r"[A-Za-z0-9_-]+", resolved) and (root / resolved).is_dir()):
-        return resolved
-    known = sorted({*SPLITS, *SPLIT_ALIASES})
-    raise InvalidInputError(f"split {split!r}: unknown{_suggest(split, known)}; choose one of {', '.join(known)}")
-
-
-def split_directory(split: str, cache: Path | None = None) -> Path:
-    """Directory of a split's objects (may not exist)."""
-    return (cache or cache_directory()) / "objects" / split
-
-
 def object_directory(name: str, split: str, cache: Path | None = None) -> Path:
     """Directory of one object (may not exist)."""
     return split_directory(split, cache) / name
@@ -130,68 +111,6 @@ def rebuild_command(name: str, split: str) -> str:
     """The command that prepares one object."""
     command = "tslam-bench assets prepare" + ("" if split == "test" else f" --split {split}")
     return f"{command} --objects {name}"
-
-
-def prepared_names(split: str, cache: Path | None = None) -> list[str]:
-    """Names of the objects that a split's directory holds, sorted."""
-    directory = split_directory(split, cache)
-    if not directory.is_dir():
-        return []
-    return sorted(path.parent.name for path in directory.glob("[!.]*/record.json"))
-
-
-def known_names(split: str, cache: Path | None = None) -> list[str]:
-    """Names (without aliases) of a split: the definition's for ``test``, what is prepared for the others; sorted."""
-    return sorted(splits.OBJECTS) if split == "test" else prepared_names(split, cache)
-
-
-def _suggest(name: str, known: list[str]) -> str:
-    """ " (did you mean ...?)" when there are near matches."""
-    near = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.5)
-    return f" (did you mean {' or '.join(near)}?)" if near else ""
-
-
-def resolve_name(name: str, split: str = "test", cache: Path | None = None) -> str:
-    """The object that ``name``, which may be an alias, stands for in a canonical split.
-
-    Raises:
-        InvalidInputError: there is no such object; the message lists near matches.
-    """
-    if split == "test":
-        if name in splits.ALIASES:
-            return splits.ALIASES[name]
-        if name in splits.EXCLUDED:
-            raise InvalidInputError(f"object {name!r}: left out of split test: {splits.EXCLUDED[name]}")
-    known = known_names(split, cache)
-    if name in known:
-        return name
-    if not known:
-        raise AssetError(
-            f"object {name!r}: split {split} is not prepared; run: tslam-bench assets prepare --split {split}"
-        )
-    candidates = [*known, *splits.ALIASES] if split == "test" else known
-    raise InvalidInputError(
-        f"object {name!r}: unknown in split {split}{_suggest(name, candidates)}; "
-        f"see: tslam-bench assets list --split {split}"
-    )
-
-
-def find_split(name: str, cache: Path | None = None) -> str:
-    """The benchmark's split that has an object of this name (or alias): test, train or val.
-
-    Raises:
-        InvalidInputError: none has; the message lists near matches.
-    """
-    for split in SPLITS:
-        if name in known_names(split, cache) or (split == "test" and name in splits.ALIASES):
-            return split
-    if name in splits.EXCLUDED:
-        return "test"  # whoever loads it learns why it is left out
-    candidates = [known for split in SPLITS for known in known_names(split, cache)]
-    raise InvalidInputError(
-        f"object {name!r}: unknown in the splits {', '.join(SPLITS)}{_suggest(name, [*candidates, *splits.ALIASES])}; "
-        "see: tslam-bench assets list --split SPLIT"
-    )
 
 
 def read_record(name: str, split: str, cache: Path | None = None) -> dict[str, Any]:
@@ -250,9 +169,8 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
     arrays = {product: _read_array(directory, product, record) for product in ARRAYS}
     try:
         faces = arrays["faces"].astype(np.int64)
-        hull_vertices, hull_faces = arrays["hull_vertices"], arrays["hull_faces"].astype(np.int64)
-        offsets = arrays["hull_offsets"].tolist()
-        hulls = tuple((hull_vertices[v0:v1], hull_faces[f0:f1]) for (v0, f0), (v1, f1) in itertools.pairwise(offsets))
+        normals = face_normals(arrays["vertices"][faces])
+        packed = arrays["hull_vertices"], arrays["hull_faces"].astype(np.int64), arrays["hull_offsets"]
         field = SignedDistanceField(
             origin=np.array(record["field"]["origin"], dtype=np.float64),
             spacing=float(record["field"]["spacing"]),
@@ -267,12 +185,12 @@ def load_object(name: str, split: str = "test", cache: Path | None = None) -> Pr
             category=record["category"],
             vertices=arrays["vertices"],
             faces=faces,
-            hulls=hulls,
+            hulls=tuple(unpack_hulls(*packed)),
             field=field,
             solid=unpack(arrays["grids"][0]),
             surface=unpack(arrays["grids"][1]),
             surface_points=arrays["surface_points"],
-            surface_normals=_face_normals(arrays["vertices"], faces)[arrays["surface_faces"]],
+            surface_normals=normals.astype(np.float32)[arrays["surface_faces"]],
             iou_cells=(x, y, z),
             solid_at_iou_points=iou_bits[0],
             raw_solid_at_iou_points=iou_bits[1],
@@ -292,13 +210,6 @@ def load_surface(name: str, split: str, cache: Path | None = None) -> tuple[NDAr
     """
     directory, record = object_directory(name, split, cache), read_record(name, split, cache)
     return _read_array(directory, "vertices", record), _read_array(directory, "faces", record).astype(np.int64)
-
-
-def _face_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
 
 
 def list_objects(split: str = "test", cache: Path | None = None) -> list[dict[str, Any]]:
@@ -348,15 +259,14 @@ def write(prepared: PreparedObject, surface_faces: NDArray[np.int64], cache: Pat
     """
     if prepared.surface_points.shape != (SURFACE_SAMPLES, 3) or surface_faces.shape != (SURFACE_SAMPLES,):
         raise InvalidInputError(f"{prepared.name}: {SURFACE_SAMPLES} surface samples with their faces expected")
-    counts = np.array([[len(vertices), len(faces)] for vertices, faces in prepared.hulls], dtype=np.int64)
-    offsets = np.concatenate([np.zeros((1, 2), dtype=np.int64), np.cumsum(counts, axis=0)])
+    hull_vertices, hull_faces, hull_offsets = pack_hulls(prepared.hulls)
     iou = np.stack([prepared.solid_at_iou_points, prepared.raw_solid_at_iou_points])
     arrays: dict[str, NDArray[Any]] = {
         "vertices": prepared.vertices.astype(np.float64),
         "faces": prepared.faces.astype(np.int32),
-        "hull_vertices": np.concatenate([vertices for vertices, _ in prepared.hulls]).astype(np.float64),
-        "hull_faces": np.concatenate([faces for _, faces in prepared.hulls]).astype(np.uint8),
-        "hull_offsets": offsets.astype(np.int32),
+        "hull_vertices": hull_vertices.astype(np.float64),
+        "hull_faces": hull_faces.astype(np.uint8),
+        "hull_offsets": hull_offsets.astype(np.int32),
         "field": prepared.field.values.astype(np.float16),
         "grids": np.stack([pack(prepared.solid), pack(prepared.surface)]),
         "surface_points": prepared.surface_points.astype(np.float32),

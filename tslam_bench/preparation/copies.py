@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.files import cache_directory, write_json
 from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.geometry.moments import moments
 from tslam_bench.objects import store
 from tslam_bench.preparation import leakage
 
@@ -96,18 +97,10 @@ def measure(mesh: TriangleMesh) -> tuple[NDArray[np.float64], NDArray[np.float64
         (5,) volume, surface and three principal standard deviations, of the solid whose root-mean-square radius is 1; and
         (3, 3) axes in columns, in order of rising deviation.
     """
-    corners = mesh.triangles() - mesh.bounds.mean(axis=0)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sixfold = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    total = corners.sum(axis=1)
-    volume = float(sixfold.sum() / 6)
-    centroid = (sixfold[:, None] * total).sum(axis=0) / (24 * volume)
-    # Integral of x x^T over the tetrahedron of a face and the origin: volume / 20 * (sum of v v^T + s s^T), s the sum of v.
-    second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, total, total)
-    variances, axes = np.linalg.eigh(second / (120 * volume) - np.outer(centroid, centroid))
+    solid = moments(mesh)
+    variances, axes = np.linalg.eigh(solid.covariance)
     radius = float(np.sqrt(variances.sum()))
-    surface = float(np.linalg.norm(normals, axis=1).sum() / 2)
-    return np.array([volume / radius**3, surface / radius**2, *np.sqrt(variances) / radius]), axes
+    return np.array([solid.volume / radius**3, mesh.area() / radius**2, *np.sqrt(variances) / radius]), axes
 
 
 def aligned_overlap(first: TriangleMesh, second: TriangleMesh) -> float:

@@ -23,6 +23,8 @@ from scipy.spatial import ConvexHull, QhullError
 from tslam_bench.errors import AssetError
 from tslam_bench.files import atomic_file
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, simplify, to_manifold, union
+from tslam_bench.geometry.moments import centroid, volume
+from tslam_bench.objects.hulls import pack_hulls, unpack_hulls
 
 MAX_HULL_VERTICES = 34
 """Vertices of one hull, so that its triangles number at most 64."""
@@ -123,7 +125,8 @@ def decompose_cached(mesh: TriangleMesh, settings: DecompositionSettings, direct
     if path.exists():
         try:
             with np.load(path) as data:
-                return unpack_hulls(data["vertices"], data["faces"], data["offsets"])
+                packed = data["vertices"], data["faces"], data["offsets"]
+                return [TriangleMesh(*hull) for hull in unpack_hulls(*packed)]
         except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
             path.unlink(missing_ok=True)  # a damaged entry is computed again
     hulls = decompose(mesh, settings)
@@ -131,23 +134,6 @@ def decompose_cached(mesh: TriangleMesh, settings: DecompositionSettings, direct
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, vertices=vertices, faces=faces, offsets=offsets)
     return hulls
-
-
-def pack_hulls(hulls: list[TriangleMesh]) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Hulls in three arrays: all vertices, all faces (indices within their hull), offsets (H + 1, 2) of both."""
-    counts = np.array([[len(hull.vertices), len(hull.faces)] for hull in hulls], dtype=np.int64)
-    offsets = np.concatenate([np.zeros((1, 2), dtype=np.int64), np.cumsum(counts, axis=0)])
-    return np.concatenate([h.vertices for h in hulls]), np.concatenate([h.faces for h in hulls]), offsets
-
-
-def unpack_hulls(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], offsets: NDArray[np.int64]
-) -> list[TriangleMesh]:
-    """Inverse of :func:`pack_hulls`."""
-    return [
-        TriangleMesh(vertices[v0:v1], faces[f0:f1])
-        for (v0, f0), (v1, f1) in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True)
-    ]
 
 
 def convex_hull(points: NDArray[np.float64]) -> TriangleMesh | None:
@@ -162,12 +148,6 @@ def convex_hull(points: NDArray[np.float64]) -> TriangleMesh | None:
     faces[inward] = faces[inward][:, ::-1]
     used, inverse = np.unique(faces, return_inverse=True)
     return TriangleMesh(points[used], inverse.reshape(-1, 3).astype(np.int64))
-
-
-def volume(mesh: TriangleMesh) -> float:
-    """Volume (m^3) that a watertight mesh encloses."""
-    a, b, c = (mesh.triangles() - mesh.vertices.mean(axis=0)).transpose(1, 0, 2)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def reduce_hull(points: NDArray[np.float64], max_vertices: int = MAX_HULL_VERTICES) -> TriangleMesh | None:
@@ -205,7 +185,7 @@ def reduce_hull(points: NDArray[np.float64], max_vertices: int = MAX_HULL_VERTIC
     if reduced is None:
         return None
     factor = (volume(full) / volume(reduced)) ** (1 / 3)
-    centre = _centroid(reduced)
+    centre = centroid(reduced)
     return TriangleMesh(centre + factor * (reduced.vertices - centre), reduced.faces)
 
 
@@ -218,14 +198,6 @@ def _extreme_simplex(points: NDArray[np.float64]) -> list[int]:
     normal = np.cross(axis, points[chosen[2]] - points[first])
     chosen.append(int(np.abs((points - points[first]) @ normal).argmax()))
     return chosen
-
-
-def _centroid(mesh: TriangleMesh) -> NDArray[np.float64]:
-    """Centre of mass (3,) of the enclosed volume."""
-    reference = mesh.vertices.mean(axis=0)
-    a, b, c = (mesh.triangles() - reference).transpose(1, 0, 2)
-    sixfold = np.einsum("ij,ij->i", a, np.cross(b, c))
-    return reference + (sixfold[:, None] * (a + b + c) / 4).sum(axis=0) / sixfold.sum()
 
 
 def hull_union(hulls: list[TriangleMesh]) -> manifold3d.Manifold:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import map_coordinates
 from scipy.sparse.linalg import lsqr
 
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
-from tslam_bench.geometry.distance import distance_to_mesh, sample_surface
+from tslam_bench.geometry.distance import distance_to_mesh
+from tslam_bench.geometry.interpolation import trilinear
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold
+from tslam_bench.geometry.sampling import sample_surface
 from tslam_bench.objects.store import SignedDistanceField
 from tslam_bench.preparation.decompose import hull_union
 
@@ -86,12 +87,6 @@ def signed_distance(
     return np.where(inside_any(points, hulls), -distance, distance)
 
 
-def trilinear(field: SignedDistanceField, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Trilinear value (M,) of the field at ``points`` (M, 3); beyond the grid the nearest border value."""
-    index = (np.asarray(points, dtype=np.float64) - field.origin) / field.spacing
-    return map_coordinates(field.values, index.T, output=np.float64, order=1, mode="nearest")
-
-
 def build_field(hulls: list[TriangleMesh], tolerance: float = SIGNED_DISTANCE_TOLERANCE) -> SignedDistanceField:
     """Samples the signed distance to the hulls' union, finely enough for ``tolerance``.
 
@@ -114,7 +109,7 @@ def build_field(hulls: list[TriangleMesh], tolerance: float = SIGNED_DISTANCE_TO
         exact = solid.signed_distance(origin + np.indices(shape).reshape(3, -1).T * spacing).reshape(shape)
         values = _fit(exact, origin, spacing, solid)
         half = values.astype(np.float16).astype(np.float32)
-        error = float(np.abs(trilinear(SignedDistanceField(origin, spacing, half, 0.0), on_surface)).max())
+        error = float(np.abs(trilinear(half, origin, spacing, on_surface)).max())
         field = SignedDistanceField(origin, spacing, half, error)
         if error <= tolerance:
             break
@@ -126,9 +121,7 @@ def _fit_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Points of the fit (M, 3), their exact signed distances (M,) and weights (M,)."""
     generator = np.random.default_rng(_SEED + 1)
-    a, b, c = solid.surface.triangles().transpose(1, 0, 2)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-    on_surface, _ = sample_surface(solid.surface, int(SURFACE_DENSITY * area / spacing**2), generator)
+    on_surface, _ = sample_surface(solid.surface, int(SURFACE_DENSITY * solid.surface.area() / spacing**2), generator)
     cells = np.argwhere(np.abs(exact[:-1, :-1, :-1]) < BAND + spacing)
     corner = np.repeat(cells, CELL_POINTS, axis=0)
     near = origin + spacing * (corner + generator.random(corner.shape))

@@ -22,8 +22,10 @@ from tslam_bench.errors import AssetError
 from tslam_bench.files import atomic_file
 from tslam_bench.geometry.distance import InsideTest, contains
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, parse_stl
+from tslam_bench.geometry.moments import moments
 from tslam_bench.geometry.scanline import inside_grid
 from tslam_bench.objects import splits
+from tslam_bench.preparation import repair, voids
 from tslam_bench.sources import contactdb
 
 MAX_OVERLAP = 0.85
@@ -67,8 +69,8 @@ def normalise(name: str, mesh: TriangleMesh) -> Shape:
     Raises:
         AssetError: the mesh holds next to no volume.
     """
-    centre, radius, volume = _moments(mesh)
-    normalised = TriangleMesh((mesh.vertices - centre) / radius, mesh.faces)
+    solid = moments(mesh)
+    normalised = TriangleMesh((mesh.vertices - solid.centroid) / solid.radius, mesh.faces)
     generator = np.random.default_rng(_SEED)
     low, high = normalised.bounds
     inside = InsideTest(normalised)
@@ -81,22 +83,7 @@ def normalise(name: str, mesh: TriangleMesh) -> Shape:
     else:
         raise AssetError("holds next to no volume in its bounding box")
     points = np.concatenate(found)[:_POINTS]
-    return Shape(name, normalised, points, volume / radius**3, _descriptor(points, generator))
-
-
-def _moments(mesh: TriangleMesh) -> tuple[NDArray[np.float64], float, float]:
-    """Centroid (3,), root-mean-square radius about it, and volume of a closed mesh: exact sums over tetrahedra."""
-    reference = mesh.bounds.mean(axis=0)
-    corners = mesh.triangles() - reference
-    sixfold = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    total = corners.sum(axis=1)
-    volume = float(sixfold.sum() / 6)
-    if not volume > 0:
-        raise AssetError("encloses no volume")
-    offset = (sixfold[:, None] * total).sum(axis=0) / (24 * volume)
-    squares = (corners**2).sum(axis=(1, 2)) + (total**2).sum(axis=1)
-    second = float((sixfold * squares).sum() / (120 * volume))
-    return reference + offset, float(np.sqrt(second - offset @ offset)), volume
+    return Shape(name, normalised, points, solid.volume / solid.radius**3, _descriptor(points, generator))
 
 
 def _descriptor(points: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:
@@ -186,8 +173,6 @@ def closest(mesh: TriangleMesh, references: list[Shape]) -> Match:
 
 def references(wheel: Path, cache: Path) -> list[Shape]:
     """The test objects, normalised; kept in ``<cache>/leakage`` after the first call."""
-    from tslam_bench.preparation import repair, voids
-
     key = hashlib.sha256(json.dumps([VERSION, contactdb.SOURCE, _POINTS, _SEED]).encode()).hexdigest()[:16]
     path = cache / "leakage" / f"references-{key}.npz"
     names = list(splits.OBJECTS)

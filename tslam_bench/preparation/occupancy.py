@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_LOW
-from tslam_bench.geometry.distance import InsideTest, contains, sample_surface
+from tslam_bench.geometry.distance import InsideTest, contains
 from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.geometry.sampling import sample_surface
 from tslam_bench.grids import voxel_centres
 
 SURFACE_SEED = 20211109

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,13 @@ from numpy.typing import NDArray
 from tslam_bench.constants import REACHABLE_BALL_RADIUS, SIGNED_DISTANCE_TOLERANCE, WORKSPACE_EDGE
 from tslam_bench.errors import AssetError
 from tslam_bench.files import cache_directory
-from tslam_bench.geometry.distance import distance_to_mesh, sample_surface, winding_numbers
+from tslam_bench.geometry.distance import distance_to_mesh, winding_numbers
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, to_manifold
-from tslam_bench.geometry.sampling import iou_cells, iou_points
+from tslam_bench.geometry.sampling import iou_cells, iou_points, sample_surface
 from tslam_bench.objects import store
 from tslam_bench.preparation import decompose, field, leakage, occupancy, repair, voids
 from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.source import Source
 from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
 PIPELINE_VERSION = 5
@@ -49,48 +49,6 @@ _SEED = 20211110
 
 class GateError(AssetError):
     """The object was built and measured, and is not good enough for its split."""
-
-
-@dataclass(frozen=True)
-class SourceMesh:
-    """A mesh as its source gives it, in metres, in its canonical orientation.
-
-    Attributes:
-        name, split, category, aliases: identifiers.
-        mesh: the triangles, not necessarily watertight.
-        source: where it comes from, for people.
-        license: its licence text.
-        sha256: hash of the source file (or of the mesh, where there is no file).
-        details: further facts for the record (creator, scale, seed).
-    """
-
-    name: str
-    split: str
-    category: str
-    mesh: TriangleMesh
-    source: str
-    license: str
-    sha256: str
-    aliases: tuple[str, ...] = ()
-    details: dict[str, Any] = dataclasses.field(default_factory=dict)
-
-
-class Source(Protocol):
-    """What can be prepared: a picklable promise of a source mesh."""
-
-    @property
-    def name(self) -> str:
-        """Name of the object."""
-
-    @property
-    def split(self) -> str:
-        """Split of the object."""
-
-    def fingerprint(self) -> str:
-        """A string that changes whenever :meth:`load` would return something else."""
-
-    def load(self, cache: Path) -> SourceMesh:
-        """Reads or makes the mesh. Raises AssetError."""
 
 
 def parameters_sha256(source: Source) -> str:

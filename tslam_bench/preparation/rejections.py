@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from tslam_bench.files import package_data, write_json
+from tslam_bench.preparation import manifest
+from tslam_bench.preparation.pipeline import parameters_sha256
+from tslam_bench.sources.source import Source
 
 Entry = dict[str, str]
 """``parameters_sha256``, ``reason`` and, for a copy of another object of train or val, ``original``."""
@@ -30,14 +33,12 @@ class Rejections:
         self._cache = cache
         self._reference = reference or package_data("assets")
 
-    def get(self, source: Any) -> str | None:
+    def get(self, source: Source) -> str | None:
         """Why ``source`` was rejected with its present parameters, or None.
 
         What the package knows of is kept in the cache from then on. It does not say that an object repeats another one of
         train or val: that depends on what else is prepared.
         """
-        from tslam_bench.preparation.pipeline import parameters_sha256
-
         parameters = parameters_sha256(source)
         entry = self.entries(source.split).get(source.name)
         if entry is not None and entry.get("parameters_sha256") == parameters:
@@ -56,10 +57,8 @@ class Rejections:
             return {}
         return dict(sorted(known.items())) if isinstance(known, dict) else {}
 
-    def add(self, source: Any, reason: str) -> None:
+    def add(self, source: Source, reason: str) -> None:
         """Remembers that a gate rejected a source."""
-        from tslam_bench.preparation.pipeline import parameters_sha256
-
         entry = {"parameters_sha256": parameters_sha256(source), "reason": reason}
         self._write(source.split, source.name, entry)
 
@@ -78,7 +77,5 @@ class Rejections:
 @functools.cache
 def _reference_entries(path: Path) -> dict[str, Entry]:
     """The rejections that a reference manifest lists; none where there is no such manifest."""
-    if not path.exists():
-        return {}
-    entries: dict[str, Entry] = json.loads(path.read_text(encoding="utf-8")).get("rejected", {})
+    entries: dict[str, Entry] = manifest.read(path)["rejected"]
     return entries

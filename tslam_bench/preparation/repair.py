@@ -16,8 +16,9 @@ from scipy import ndimage
 from skimage import measure
 
 from tslam_bench.errors import AssetError
-from tslam_bench.geometry.distance import distance_to_mesh, sample_surface, winding_numbers
+from tslam_bench.geometry.distance import distance_to_mesh, winding_numbers
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, simplify, to_manifold, union
+from tslam_bench.geometry.sampling import sample_surface
 
 MAX_TRIANGLES = 8_000
 """Triangles of a ground-truth mesh."""
@@ -61,8 +62,7 @@ def repair(mesh: TriangleMesh) -> Repaired:
     Raises:
         AssetError: nothing solid can be made of it.
     """
-    a, b, c = mesh.triangles().transpose(1, 0, 2)
-    if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+    if not mesh.area() > 0:
         raise AssetError("the mesh has no area")
     method: Method = "kept"
     solid = to_manifold(mesh, merge=True)
@@ -132,9 +132,7 @@ def near_surface(
     mesh: TriangleMesh, origin: NDArray[np.float64], spacing: float, shape: tuple[int, int, int]
 ) -> NDArray[np.bool_]:
     """Grid samples whose cell neighbourhood the surface passes (from samples four to a spacing)."""
-    a, b, c = mesh.triangles().transpose(1, 0, 2)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-    count = int(np.clip(16 * area / spacing**2, 20_000, 8_000_000))
+    count = int(np.clip(16 * mesh.area() / spacing**2, 20_000, 8_000_000))
     points, _ = sample_surface(mesh, count, np.random.default_rng(_SEED))
     index = np.round((np.concatenate([points, mesh.vertices]) - origin) / spacing).astype(int)
     near = np.zeros(shape, dtype=bool)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import sys
@@ -12,51 +11,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from tslam_bench.constants import PROTOCOL_VERSION
 from tslam_bench.errors import BenchmarkError, InvalidInputError
-from tslam_bench.files import atomic_file, cache_directory, ensure_writable_directory, remove_directory, write_json
+from tslam_bench.files import cache_directory, ensure_writable_directory, remove_directory
 from tslam_bench.objects import splits, store
+from tslam_bench.preparation import copies, leakage, manifest
+from tslam_bench.preparation.pipeline import LEAKAGE_SPLITS, GateError, parameters_sha256, prepare_object
 from tslam_bench.preparation.rejections import Rejections
 from tslam_bench.preparation.workers import WorkerPool
-from tslam_bench.sources import contactdb, wheels
+from tslam_bench.sources import wheels
 from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.source import Source
 
-MANIFEST_VERSION = 2
-"""Version of the manifest's layout."""
 TIME_LIMIT = 900.0
 """Seconds after which an object is given up."""
 _STALE_AGE = 6 * 3600.0
-
-
-@dataclass(frozen=True)
-class ContactDBSource:
-    """A test object, read from the pinned wheel in the cache."""
-
-    name: str
-    split: str = "test"
-
-    def fingerprint(self) -> str:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
-        return f"{wheels.CONTACTDB_WHEEL.sha256}:{contactdb.member(self.name)}"
-
-    def load(self, cache: Path) -> Any:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
-        from tslam_bench.geometry.meshes import parse_stl
-        from tslam_bench.preparation.pipeline import SourceMesh
-
-        item = splits.OBJECTS[self.name]
-        data = contactdb.read_mesh_file(self.name, fetch(wheels.CONTACTDB_WHEEL, cache))
-        return SourceMesh(
-            name=item.name,
-            split=self.split,
-            category=item.category,
-            mesh=parse_stl(data),
-            source=f"{contactdb.SOURCE}: {contactdb.member(self.name)}",
-            license=contactdb.LICENSE,
-            sha256=contactdb.source_sha256(data),
-            aliases=item.aliases,
-            details={"official_name": item.official_name},
-        )
 
 
 @dataclass(frozen=True)
@@ -76,10 +44,8 @@ class Outcome:
     record: dict[str, Any] | None
 
 
-def _work(source: Any, cache: Path) -> Outcome:
+def _work(source: Source, cache: Path) -> Outcome:
     """Prepares one object in a worker."""
-    from tslam_bench.preparation.pipeline import GateError, prepare_object
-
     try:
         return Outcome(source.name, "prepared", "", prepare_object(source, cache))
     except GateError as error:
@@ -91,10 +57,8 @@ def _work(source: Any, cache: Path) -> Outcome:
         return Outcome(source.name, "failed", message.splitlines()[0], None)
 
 
-def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
+def _reason_to_rebuild(source: Source, cache: Path) -> str | None:
     """Why an object has to be (re)built; "" when it was never prepared; None when it is intact."""
-    from tslam_bench.preparation.pipeline import parameters_sha256
-
     directory = store.object_directory(source.name, source.split, cache)
     if not directory.exists():
         return ""
@@ -109,7 +73,7 @@ def _reason_to_rebuild(source: Any, cache: Path) -> str | None:
 
 
 def prepare(
-    items: Iterable[Any],
+    items: Iterable[Source],
     count: int | None = None,
     cache: Path | None = None,
     workers: int = 2,
@@ -122,7 +86,7 @@ def prepare(
     when the reference manifests were made, are not tried again with the same parameters.
 
     Args:
-        items: sources (see :class:`tslam_bench.preparation.pipeline.Source`).
+        items: sources (see :class:`tslam_bench.sources.source.Source`).
         count: stop once this many are in the cache (default: all); a rejected object is replaced by the next source.
         cache: cache directory (default: the user's).
         workers: processes.
@@ -139,7 +103,7 @@ def prepare(
     rejections = Rejections(cache)
     ready = 0
     shared = False
-    pool: WorkerPool[tuple[Any, str], Outcome] = WorkerPool(_work, workers, time_limit)
+    pool: WorkerPool[tuple[Source, str], Outcome] = WorkerPool(_work, workers, time_limit)
     try:
         while True:
             while ready + pool.busy < wanted and pool.has_room:
@@ -173,7 +137,7 @@ def prepare(
 
 
 def prepare_distinct(
-    items: Iterable[Any],
+    items: Iterable[Source],
     count: int | None = None,
     cache: Path | None = None,
     workers: int = 2,
@@ -206,7 +170,7 @@ def prepare_distinct(
             return
 
 
-def drop_copies(items: Sequence[Any], cache: Path | None = None) -> list[Outcome]:
+def drop_copies(items: Sequence[Source], cache: Path | None = None) -> list[Outcome]:
     """Removes prepared objects that are copies of others (:mod:`tslam_bench.preparation.copies`) and remembers that.
 
     Args:
@@ -217,14 +181,11 @@ def drop_copies(items: Sequence[Any], cache: Path | None = None) -> list[Outcome
         a ``rejected`` outcome for every object of ``items`` that was removed. Objects of val that repeat one of train are
         removed whenever either split is prepared, but only those in ``items`` are returned.
     """
-    from tslam_bench.preparation import copies
-    from tslam_bench.preparation.pipeline import LEAKAGE_SPLITS
-
     cache = cache or cache_directory()
     split = items[0].split if items else ""
     if split not in LEAKAGE_SPLITS:
         return []
-    prepared = {each: store.prepared_names(each, cache) for each in LEAKAGE_SPLITS}
+    prepared = {each: splits.prepared_names(each, cache) for each in LEAKAGE_SPLITS}
     names = list(dict.fromkeys(item.name for item in items))
     examined = [(split, name) for name in names if name in set(prepared[split])]
     others = [(split, name) for name in prepared[split] if name not in set(names)]
@@ -250,25 +211,21 @@ def remove_unlisted(split: str, names: Iterable[str], cache: Path | None = None)
     Raises:
         InvalidInputError: ``split`` is one of the benchmark's own.
     """
-    if split in store.SPLITS:
+    if split in splits.SPLITS:
         raise InvalidInputError(f"split {split!r}: is not an organiser's own")
     cache = cache or cache_directory()
-    gone = sorted(set(store.prepared_names(split, cache)) - set(names))
+    gone = sorted(set(splits.prepared_names(split, cache)) - set(names))
     for name in gone:
         remove_directory(store.object_directory(name, split, cache))
     return gone
 
 
-def _prepare_shared(item: Any, cache: Path) -> None:
+def _prepare_shared(item: Source, cache: Path) -> None:
     """Fetches what several workers need, once, before they start."""
-    from tslam_bench.preparation.pipeline import LEAKAGE_SPLITS
-
     if item.split == "test" or item.split in LEAKAGE_SPLITS:
         wheel = fetch(wheels.CONTACTDB_WHEEL, cache)
         if item.split in LEAKAGE_SPLITS:
-            from tslam_bench.preparation.leakage import references
-
-            references(wheel, cache)
+            leakage.references(wheel, cache)
 
 
 def _remove_stale(cache: Path) -> None:
@@ -279,38 +236,8 @@ def _remove_stale(cache: Path) -> None:
 
 
 def write_manifest(split: str, path: Path | None = None, cache: Path | None = None) -> Path:
-    """Writes the manifest of what is prepared of a split: ``<cache>/manifest-<split>.json`` unless ``path`` is given.
-
-    A manifest that is written elsewhere is a reference to keep under version control. That of train and val is short: a line
-    per object with one hash over its products, and every rejection with its reason.
-    """
+    """Writes the manifest of what is prepared of a split: ``<cache>/manifest-<split>.json`` unless ``path`` is given."""
     cache = cache or cache_directory()
-    records = store.list_objects(split, cache)
-    manifest: dict[str, Any] = {
-        "manifest_version": MANIFEST_VERSION,
-        "protocol_version": PROTOCOL_VERSION,
-        "split": split,
-        "objects": records,
-    }
-    if path is None or split == "test":
-        path = path or cache / f"manifest-{split}.json"
-        write_json(path, manifest)
-        return path
-    lines = [json.dumps(_short(record), sort_keys=True, allow_nan=False) for record in records]
-    names = {record["name"] for record in records}
-    rejected = {name: entry for name, entry in Rejections(cache).entries(split).items() if name not in names}
-    head = json.dumps(manifest | {"objects": [], "rejected": rejected}, indent=1, sort_keys=True, allow_nan=False)
-    with atomic_file(path) as temporary:
-        text = head.replace('"objects": []', '"objects": [\n' + ",\n".join(lines) + "\n ]", 1)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    path = path or cache / f"manifest-{split}.json"
+    manifest.write(path, split, store.list_objects(split, cache), Rejections(cache).entries(split))
     return path
-
-
-def _short(record: dict[str, Any]) -> dict[str, Any]:
-    """A record without what only the files beside it need, and with one hash and the size of all of them."""
-    products = {name: stated["sha256"] for name, stated in record["products"].items()}
-    short = {key: value for key, value in record.items() if key not in ("products", "decomposition", "field")}
-    return short | {
-        "products_sha256": hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest(),
-        "bytes": sum(stated["bytes"] for stated in record["products"].values()),
-    }

@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from tslam_bench.constants import OCCUPANCY_THRESHOLD
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.grids import turn
 from tslam_bench.reconstruction.inputs import GRID_SHAPE, check_grids, empty_volume
 from tslam_bench.reconstruction.training_shapes import axis_rotations
 from tslam_bench.reconstruction.volume import Volume
@@ -105,8 +106,8 @@ class RetrievalReconstructor:
         rotations = axis_rotations()
         free = visited & ~touched
         # The input is turned back into each shape's frame, which is cheaper than turning every shape.
-        touched_turned = np.stack([turn_grid(touched, rotation.T).reshape(-1) for rotation in rotations])
-        free_turned = np.stack([turn_grid(free, rotation.T).reshape(-1) for rotation in rotations])
+        touched_turned = np.stack([turn(touched, rotation.T).reshape(-1) for rotation in rotations])
+        free_turned = np.stack([turn(free, rotation.T).reshape(-1) for rotation in rotations])
         count = len(self._solids)
         cost = self._surface_cost.reshape(count, -1) @ touched_turned.T.astype(np.float32) / touched.sum()
         cost += self._solid_cost.reshape(count, -1) @ free_turned.T.astype(np.float32)
@@ -119,13 +120,4 @@ class RetrievalReconstructor:
         if not touched.any():
             return empty_volume()
         shape, rotation, _ = self.best_match(touched, visited)
-        return Volume(turn_grid(self._solids[shape], rotation).astype(np.float32), "linear")
-
-
-def turn_grid(grid: NDArray, rotation: NDArray[np.int64]) -> NDArray:
-    """Moves each voxel of ``grid`` (32, 32, 32) to where ``rotation``, a signed permutation, takes its centre."""
-    if grid.shape != GRID_SHAPE:
-        raise InvalidInputError(f"grid: shape {grid.shape}; expected {GRID_SHAPE}")
-    source_axis = np.abs(rotation).argmax(axis=1)
-    turned = grid.transpose(tuple(source_axis))
-    return np.flip(turned, axis=tuple(a for a in range(3) if rotation[a, source_axis[a]] < 0))
+        return Volume(turn(self._solids[shape], rotation).astype(np.float32), "linear")

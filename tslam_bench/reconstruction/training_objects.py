@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.objects.store import PreparedObject, check_split, list_objects, load_object, resolve_name
+from tslam_bench.objects.splits import check_split, resolve_name
+from tslam_bench.objects.store import PreparedObject, list_objects, load_object
 from tslam_bench.reconstruction.training_shapes import TrainingShape, training_shape
 
 _SHAPE_STREAM = 3  # keeps the samples of the shapes apart from other uses of the seed

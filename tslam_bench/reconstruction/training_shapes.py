@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.constants import WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.geometry.triangles import areas, face_normals
 
 NEAR_SURFACE_SIGMAS: Final = (0.02, 0.005)
 """Standard deviations of the near-surface query points about the surface (m): 2.6 and 0.6 voxels."""
@@ -94,9 +95,8 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
         raise InvalidInputError(f"{name}: encloses no volume; training shapes must be watertight solids") from error
 
     triangles = vertices[faces]
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    areas = np.linalg.norm(cross, axis=1)
-    chosen = generator.choice(len(faces), SURFACE_POINTS, p=areas / areas.sum())
+    area = areas(triangles)
+    chosen = generator.choice(len(faces), SURFACE_POINTS, p=area / area.sum())
     u, v = generator.random((2, SURFACE_POINTS, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     corner, first, second = triangles[chosen].transpose(1, 0, 2)
@@ -118,7 +118,7 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
         half_extents=half_extents,
         vertices=corners,
         surface_points=surface_points,
-        surface_normals=cross[chosen] / areas[chosen, None],
+        surface_normals=face_normals(triangles[chosen]),
         box_points=box_points,
         box_inside=winding_inside(vertices, faces, box_points),
         near_points=near_points,

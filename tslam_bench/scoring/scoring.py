@@ -18,7 +18,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from tslam_bench import grids
 from tslam_bench.constants import (
@@ -26,13 +25,13 @@ from tslam_bench.constants import (
     GRID_SIZE,
     HORIZON,
     PROTOCOL_VERSION,
-    QUICK_OBJECTS,
     VOXEL_EDGE,
 )
 from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.geometry.interpolation import trilinear
 from tslam_bench.geometry.sampling import IouPoints
-from tslam_bench.objects.splits import OBJECTS
-from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object, resolve_name
+from tslam_bench.objects.splits import object_set, resolve_name
+from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring import metrics
 from tslam_bench.scoring.aggregate import Estimate, estimate_all
@@ -251,11 +250,6 @@ def score_submission(
     )
 
 
-def object_set(name: str) -> tuple[str, ...]:
-    """Objects of ``"quick"`` or ``"test"``."""
-    return QUICK_OBJECTS if name == "quick" else tuple(sorted(OBJECTS))
-
-
 def _score_all(
     submission: Submission, path: Path, names: Sequence[str], pool: ProcessPoolExecutor | None, cache: Path | None
 ) -> Iterator[list[ObjectScore]]:
@@ -412,11 +406,9 @@ def implausible_touches(touched: NDArray[np.bool_], prepared: PreparedObject) ->
     if len(centres) == 0:
         return 0.0
     field = prepared.field
-    index = (centres - field.origin) / field.spacing
-    distance = map_coordinates(field.values, index.T, order=1, mode="constant", cval=np.inf, prefilter=False)
-    limit = VOXEL_HALF_DIAGONAL + PLAUSIBLE_SLACK
-    # Outside the field's padding (inf or the nan that interpolation makes of it) is too far in any case.
-    return float(np.mean(~(np.abs(distance) <= limit)))
+    # Beyond the grid the border's value counts: it is the padding or more, and too far in any case.
+    distance = trilinear(field.values, field.origin, field.spacing, centres)
+    return float(np.mean(np.abs(distance) > VOXEL_HALF_DIAGONAL + PLAUSIBLE_SLACK))
 
 
 def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:

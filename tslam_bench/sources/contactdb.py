@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 from tslam_bench.errors import AssetError
+from tslam_bench.geometry.meshes import parse_stl
 from tslam_bench.objects.splits import OBJECTS
+from tslam_bench.sources.fetch import fetch
+from tslam_bench.sources.source import SourceMesh
 from tslam_bench.sources.wheels import CONTACTDB_WHEEL
 
 LICENSE = "Apache-2.0 as published by object_sim; shapes from third-party models through ContactDB and GRAB"
@@ -43,3 +47,31 @@ def read_mesh_file(name: str, wheel: Path) -> bytes:
 def source_sha256(data: bytes) -> str:
     """Hexadecimal SHA-256 of a source file's bytes."""
     return hashlib.sha256(data).hexdigest()
+
+
+@dataclass(frozen=True)
+class ContactDBSource:
+    """A test object, read from the pinned wheel in the cache."""
+
+    name: str
+    split: str = "test"
+
+    def fingerprint(self) -> str:
+        """See :class:`tslam_bench.sources.source.Source`."""
+        return f"{CONTACTDB_WHEEL.sha256}:{member(self.name)}"
+
+    def load(self, cache: Path) -> SourceMesh:
+        """See :class:`tslam_bench.sources.source.Source`."""
+        item = OBJECTS[self.name]
+        data = read_mesh_file(self.name, fetch(CONTACTDB_WHEEL, cache))
+        return SourceMesh(
+            name=item.name,
+            split=self.split,
+            category=item.category,
+            mesh=parse_stl(data),
+            source=f"{SOURCE}: {member(self.name)}",
+            license=LICENSE,
+            sha256=source_sha256(data),
+            aliases=item.aliases,
+            details={"official_name": item.official_name},
+        )

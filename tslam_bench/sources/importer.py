@@ -12,8 +12,11 @@ from typing import Any
 
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import sha256_file
-from tslam_bench.objects import store
+from tslam_bench.geometry.meshes import TriangleMesh
+from tslam_bench.objects import splits, store
 from tslam_bench.sources import meshfiles
+from tslam_bench.sources.scaling import scale_to_hand
+from tslam_bench.sources.source import SourceMesh
 
 SKIPPED_SUFFIXES = (
     ".mtl",
@@ -58,19 +61,15 @@ class ImportedSource:
     unit: float | None = None
 
     def fingerprint(self) -> str:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
+        """See :class:`tslam_bench.sources.source.Source`."""
         try:
             digest = sha256_file(Path(self.path))
         except OSError:
             digest = "unreadable"
         return f"imported:{digest}:{self.up}:{self.unit}:{self.category}:{self.license}:{self.origin}"
 
-    def load(self, cache: Path) -> Any:
-        """See :class:`tslam_bench.preparation.pipeline.Source`. Errors name the file."""
-        from tslam_bench.geometry.meshes import TriangleMesh
-        from tslam_bench.preparation.pipeline import SourceMesh
-        from tslam_bench.sources.scaling import scale_to_hand
-
+    def load(self, cache: Path) -> SourceMesh:
+        """See :class:`tslam_bench.sources.source.Source`. Errors name the file."""
         try:
             self._check_name_is_free(cache)
             mesh = meshfiles.read_mesh_file(Path(self.path), self.up)
@@ -94,7 +93,7 @@ class ImportedSource:
 
     def _check_name_is_free(self, cache: Path) -> None:
         """Raises AssetError if an object of another source has this name in a split that is the benchmark's own."""
-        if self.split not in store.SPLITS:
+        if self.split not in splits.SPLITS:
             return
         try:
             holder = store.read_record(self.name, self.split, cache)["source"]
@@ -187,7 +186,7 @@ def read_set(manifest: Path) -> tuple[str, list[ImportedSource]]:
         if not isinstance(content.get(key), str) or not content[key].strip():
             raise InvalidInputError(f"{manifest}: {key!r} is missing or is not a text")
     split = check_name(content["split"], f"{manifest}: split")
-    if split in store.SPLITS or split in store.SPLIT_ALIASES:
+    if split in splits.SPLITS or split in splits.SPLIT_ALIASES:
         raise InvalidInputError(f"{manifest}: split {split!r} is the benchmark's own; choose another name")
     root = manifest.parent.resolve()
     sources: dict[str, ImportedSource] = {}

@@ -20,7 +20,11 @@ import numpy as np
 
 from tslam_bench.errors import AssetError
 from tslam_bench.files import atomic_directory, write_json
+from tslam_bench.geometry.meshes import TriangleMesh
 from tslam_bench.sources.fetch import fetch_file
+from tslam_bench.sources.meshfiles import parse_mesh
+from tslam_bench.sources.scaling import scale_to_hand
+from tslam_bench.sources.source import SourceMesh
 from tslam_bench.sources.wheels import FURNITURE_PACKAGE
 
 LICENSES = {
@@ -146,16 +150,11 @@ class FurnitureSource:
         return f"{title}-{self.catalogue.lower()}-{self.number:03d}"
 
     def fingerprint(self) -> str:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
+        """See :class:`tslam_bench.sources.source.Source`."""
         return f"{FURNITURE_PACKAGE.sha256}:{self.catalogue}:{self.member}:{self.rotation}"
 
-    def load(self, cache: Path) -> Any:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
-        from tslam_bench.geometry.meshes import TriangleMesh
-        from tslam_bench.preparation.pipeline import SourceMesh
-        from tslam_bench.sources.meshfiles import parse_mesh
-        from tslam_bench.sources.scaling import scale_to_hand
-
+    def load(self, cache: Path) -> SourceMesh:
+        """See :class:`tslam_bench.sources.source.Source`."""
         with zipfile.ZipFile(_catalogues(cache) / f"{self.catalogue}.sh3f") as archive:
             data = archive.read(self.member)
         mesh = parse_mesh(data, ".obj")

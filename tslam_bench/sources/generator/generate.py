@@ -17,6 +17,7 @@ import numpy as np
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, simplify
 from tslam_bench.sources.generator.household import CATEGORIES
+from tslam_bench.sources.source import SourceMesh
 
 GENERATOR_VERSION = 1
 """Bumped when the same seed gives another shape."""
@@ -82,13 +83,11 @@ class GeneratedSource:
         return f"{self.category}-{self.index:03d}"
 
     def fingerprint(self) -> str:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
+        """See :class:`tslam_bench.sources.source.Source`."""
         return f"generated:{GENERATOR_VERSION}:{GENERATOR_SEED}:{self.name}"
 
-    def load(self, cache: Path) -> Any:
-        """See :class:`tslam_bench.preparation.pipeline.Source`."""
-        from tslam_bench.preparation.pipeline import SourceMesh
-
+    def load(self, cache: Path) -> SourceMesh:
+        """See :class:`tslam_bench.sources.source.Source`."""
         mesh, details = draw(self.category, self.index)
         return SourceMesh(
             name=self.name,

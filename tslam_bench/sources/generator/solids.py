@@ -78,21 +78,17 @@ def superellipse(a: float, b: float, power: float, segments: int = 48) -> NDArra
     return np.column_stack([a * np.sign(c) * np.abs(c) ** (2 / power), b * np.sign(s) * np.abs(s) ** (2 / power)])
 
 
-def spline(knots: ArrayLike, count: int = 32, closed: bool = False) -> NDArray[np.float64]:
+def spline(knots: ArrayLike, count: int = 32) -> NDArray[np.float64]:
     """Smooth curve (count, D) through ``knots`` (K, D)."""
     points = np.asarray(knots, dtype=float)
-    if closed:
-        points = np.vstack([points, points[:1]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    t = np.linspace(0, length[-1], count + 1)[:-1] if closed else np.linspace(0, length[-1], count)
-    return CubicSpline(length, points, bc_type="periodic" if closed else "natural")(t)
+    return CubicSpline(length, points, bc_type="natural")(np.linspace(0, length[-1], count))
 
 
 def sweep(
     path: ArrayLike,
     section: ArrayLike | float,
     scale: ArrayLike | None = None,
-    closed: bool = False,
     side: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Manifold:
     """A section carried along a path.
@@ -101,17 +97,16 @@ def sweep(
         path: (N, 3) points; must not turn more sharply than the section is wide.
         section: corners (S, 2) of a convex polygon in the plane across the path, or the radius of a round one.
         scale: (N,) factors along the path (default: ones).
-        closed: whether the path's end joins its start.
         side: direction that the section's second axis leans to.
     """
     points = np.asarray(path, dtype=float)
     corners = circle(section, 20) if isinstance(section, float | int) else np.asarray(section, dtype=float)
     factors = np.ones(len(points)) if scale is None else np.asarray(scale, dtype=float)
-    tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0) if closed else np.gradient(points, axis=0)
+    tangent = np.gradient(points, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     up = np.asarray(side, dtype=float)
     if np.abs(tangent @ up).max() > 0.99:  # the path runs along that direction somewhere: carry a frame along it
-        across, up_axis = _transported_frames(tangent, closed)
+        across, up_axis = _transported_frames(tangent)
     else:
         across = np.cross(up, tangent)
         across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -120,46 +115,35 @@ def sweep(
         corners[None, :, :1] * across[:, None] + corners[None, :, 1:] * up_axis[:, None]
     )
     n, s = rings.shape[:2]
-    vertices = rings.reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(n if closed else n - 1), np.arange(s), indexing="ij")
+    start, end = n * s, n * s + 1
+    vertices = np.vstack([rings.reshape(-1, 3), points[0], points[-1]])
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(s), indexing="ij")
     a, b = i * s + j, i * s + (j + 1) % s
-    c, d = ((i + 1) % n) * s + j, ((i + 1) % n) * s + (j + 1) % s
-    faces = np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    if not closed:
-        start, end = len(vertices), len(vertices) + 1
-        vertices = np.vstack([vertices, points[0], points[-1]])
-        k = np.arange(s)
-        following = (k + 1) % s
-        last = (n - 1) * s
-        faces = np.concatenate(
-            [
-                faces,
-                np.column_stack([following, k, np.full(s, start)]),
-                np.column_stack([last + k, last + following, np.full(s, end)]),
-            ]
-        )
+    c, d = a + s, b + s
+    k = np.arange(s)
+    following, last = (k + 1) % s, (n - 1) * s
+    faces = np.concatenate(
+        [
+            np.stack([a, b, d], -1).reshape(-1, 3),
+            np.stack([a, d, c], -1).reshape(-1, 3),
+            np.column_stack([following, k, np.full(s, start)]),
+            np.column_stack([last + k, last + following, np.full(s, end)]),
+        ]
+    )
     solid = to_manifold(TriangleMesh(vertices, faces.astype(np.int64)))
     if solid.volume() < 0:
         solid = to_manifold(TriangleMesh(vertices, faces[:, ::-1].astype(np.int64)))
     return solid
 
 
-def _transported_frames(tangent: NDArray[np.float64], closed: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frames across a path that do not twist; on a closed path the twist left over is spread along it."""
+def _transported_frames(tangent: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frames across a path that do not twist."""
     first = np.cross(tangent[0], np.eye(3)[np.abs(tangent[0]).argmin()])
     across = [first / np.linalg.norm(first)]
     for t in tangent[1:]:
         carried = across[-1] - (across[-1] @ t) * t
         across.append(carried / np.linalg.norm(carried))
-    result = np.array(across)
-    up = np.cross(tangent, result)
-    if closed:
-        back = result[-1] - (result[-1] @ tangent[0]) * tangent[0]
-        twist = np.arctan2(back @ up[0], back @ result[0])
-        angle = -twist * np.arange(len(result)) / len(result)
-        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-        result, up = c * result + s * up, -s * result + c * up
-    return result, up
+    return np.array(across), np.cross(tangent, np.array(across))
 
 
 def box(x: float, y: float, z: float, radius: float = 0.0) -> Manifold:

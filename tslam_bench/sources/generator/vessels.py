@@ -178,13 +178,7 @@ def plate(g: Random) -> tuple[Manifold, int]:
     flat = g.uniform(0.55, 0.7)
     top = [(1.0, height), (flat, height * 0.35 + wall * 0.2), (0.0, wall)]
     under = [(0.0, 0.0), (flat * 0.9, 0.0), (1.0, height - wall)]
-    outline = np.array([*under, *top])
-    return ring_or_lathe(outline), 0
-
-
-def ring_or_lathe(outline: np.ndarray) -> Manifold:
-    """A closed outline (radius, z) that touches the axis, turned."""
-    return ring(outline)
+    return ring([*under, *top]), 0
 
 
 @category("train", 0.1, 0.2)

@@ -5,9 +5,8 @@ import pytest
 from manifold3d import Manifold
 
 from tslam_bench.constants import IOU_INSIDE_POINTS, VOXEL_EDGE
-from tslam_bench.geometry.distance import sample_surface
 from tslam_bench.geometry.meshes import from_manifold, to_manifold
-from tslam_bench.geometry.sampling import iou_cells, iou_points
+from tslam_bench.geometry.sampling import iou_cells, iou_points, sample_surface
 from tslam_bench.grids import points_to_grid, voxel_centres
 from tslam_bench.preparation import occupancy
 from tslam_bench.sources.generator import generate

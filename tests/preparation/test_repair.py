@@ -12,8 +12,9 @@ from scipy.spatial import ConvexHull, cKDTree
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError
 from tslam_bench.files import package_data
-from tslam_bench.geometry.distance import distance_to_mesh, sample_surface
+from tslam_bench.geometry.distance import distance_to_mesh
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, to_manifold
+from tslam_bench.geometry.sampling import sample_surface
 from tslam_bench.objects import splits
 from tslam_bench.objects.store import load_object
 from tslam_bench.preparation import repair

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from tslam_bench.geometry.distance import distance_to_mesh, sample_surface
+from tslam_bench.geometry.distance import distance_to_mesh
 from tslam_bench.geometry.meshes import from_manifold, to_manifold
+from tslam_bench.geometry.sampling import sample_surface
 from tslam_bench.preparation.voids import fill_voids
 from tslam_bench.sources.generator import generate
 from tslam_bench.sources.generator.solids import circle, cylinder, ring

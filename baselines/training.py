@@ -28,6 +28,7 @@ from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
+from tslam_bench.machine import processor_name
 from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.registration import make_vec
 from tslam_bench.version import __version__
@@ -146,14 +147,7 @@ def learning_device(config: TrainingConfig) -> str:
 
 def machine_description() -> dict[str, Any]:
     """Kind of machine: system, processor and cores."""
-    processor = platform.processor() or platform.machine()
-    cpu_info = Path("/proc/cpuinfo")
-    if cpu_info.is_file():
-        names = [
-            line.split(":", 1)[1].strip() for line in cpu_info.read_text().splitlines() if line.startswith("model name")
-        ]
-        processor = names[0] if names else processor
-    return {"system": platform.system(), "processor": processor, "cores": os.cpu_count()}
+    return {"system": platform.system(), "processor": processor_name(), "cores": os.cpu_count()}
 
 
 class _Log:

@@ -31,6 +31,8 @@ from rich.table import Table
 from tslam_bench.constants import WORKSPACE_EDGE
 from tslam_bench.errors import AssetError
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, parse_stl
+from tslam_bench.geometry.moments import volume
+from tslam_bench.geometry.triangles import face_normals
 from tslam_bench.objects import store
 from tslam_bench.preparation import repair, schedule
 from tslam_bench.preparation.pipeline import MIN_EXTENT, MIN_HULL_IOU, check_gates, check_size
@@ -46,15 +48,12 @@ COARSE_CELLS = {"REMESH_CELLS": 64, "BALL_CELLS": 128}
 """Samples along the longest edge when the cheap pass rebuilds a surface (few enough to be fast, enough to tell a sheet)."""
 
 REASONS = (
-    ("not what its name says", r"not the \.\w+ file|unknown kind of file|SketchUp|not a COLLADA"),
-    (
-        "not readable",
-        r"not a readable|cannot be read|not a binary glTF|glTF \w+ (is|are)|glTF header|inconsistent|version \d+",
-    ),
+    ("not what its name says", r"unknown kind of file|SketchUp|not a COLLADA"),
+    ("not readable", r"not a readable|cannot be read|glTF (\w+ are|is)"),
     ("empty, or holds no triangles", r"empty file|no triangles|holds 0 meshes"),
-    ("announces more than it holds", r"announces|reaches outside|has fewer lines|larger than it says"),
+    ("announces more than it holds", r"larger than it says"),
     ("refers to what is not there", r"refers? to|not there|vertex 0|negative numbers|outside the file's folder"),
-    ("above a limit", r"limit|nested|deeper|chain|circle|two parents|refused as a bomb|needs more memory"),
+    ("above a limit", r"limit|chain|refused as a bomb|needs more memory"),
     ("archive refused", r"archive"),
     ("not finite, or far out", r"not finite|further out|none that moves"),
     ("unit", r"outside 0\.005 to|check the unit|\bunit\b"),
@@ -140,8 +139,7 @@ def broken_invariant(mesh: TriangleMesh) -> str:
         return "a directed edge occurs twice"
     if not np.array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)):
         return "not watertight"
-    a, b, c = mesh.triangles().transpose(1, 0, 2)
-    if not np.einsum("ij,ij->", a, np.cross(b, c)) > 0:
+    if not volume(mesh) > 0:
         return "no positive volume"
     if not MIN_EXTENT <= mesh.extents.max() <= WORKSPACE_EDGE:
         return f"longest edge {mesh.extents.max():.4g} m"
@@ -158,9 +156,7 @@ def broken_product(name: str, cache: Path) -> str:
         return "hull IoU below the gate"
     for vertices, faces in prepared.hulls:
         corners = vertices[faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        beyond = np.einsum("fvk,fk->fv", vertices[None] - corners[:, :1], normal).max()
+        beyond = np.einsum("fvk,fk->fv", vertices[None] - corners[:, :1], face_normals(corners)).max()
         if len(vertices) > 64 or len(faces) > 64 or not beyond < 1e-6:
             return f"a hull has {len(vertices)} vertices, {len(faces)} faces, {1e6 * beyond:.2f} um of concavity"
     return broken_invariant(TriangleMesh(prepared.vertices, prepared.faces))

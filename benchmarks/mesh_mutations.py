@@ -432,7 +432,10 @@ HOSTILE: dict[str, bytes | dict[str, bytes]] = {
     "matrix.glb": _with((("nodes", 0, "matrix"), [1e308] * 16)),
     "child.glb": _with((("nodes", 0, "children"), [7])),
     "mesh.glb": _with((("nodes", 0, "mesh"), 7)),
-    "draco.glb": _with((("extensionsRequired",), ["KHR_draco_mesh_compression"])),
+    "draco.glb": _with(
+        (("extensionsRequired",), ["KHR_draco_mesh_compression"]),
+        (("accessors", 0), {"componentType": 5126, "count": 4, "type": "VEC3"}),
+    ),
     "json.glb": glb({})[:20] + b"[" * 100_000,
     "list.glb": _with((("meshes",), {"a": 1})),
     "address.gltf": json.dumps(

@@ -1,10 +1,10 @@
-"""What the benchmarks say in the end: Markdown tables in the docs, a JSON file, and the machine they ran on."""
+"""What the benchmarks say in the end: tables in the docs and on the terminal, a JSON file, and the machine they ran on."""
 
 from __future__ import annotations
 
 import json
 import os
-import platform
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import atomic_file
+from tslam_bench.machine import processor_name
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
+from sections import filled
+from sections import table as markdown_table
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+__all__ = ["machine", "markdown_table", "print_table", "replace_section", "write_json"]
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[Any]], title: str | None = None) -> None:
@@ -36,13 +36,8 @@ def replace_section(page: Path, name: str, text: str) -> None:
     Raises:
         InvalidInputError: the page lacks these lines.
     """
-    begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-    content = page.read_text(encoding="utf-8")
-    if content.count(begin) != 1 or content.count(end) != 1:
-        raise InvalidInputError(f"{page}: needs exactly one line {begin!r} and one {end!r}")
-    before, rest = content.split(begin)
-    after = rest.split(end)[1]
-    page.write_text(f"{before}{begin}\n{text.strip()}\n{end}{after}", encoding="utf-8")
+    with atomic_file(page) as temporary:
+        temporary.write_text(filled(page, {name: text}), encoding="utf-8")
 
 
 def write_json(path: Path | None, result: Any) -> None:
@@ -53,9 +48,5 @@ def write_json(path: Path | None, result: Any) -> None:
 
 def machine() -> str:
     """Cores, processor and its load by others, in a few words."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
-    return f"{len(os.sched_getaffinity(0))} cores, {model}, load {os.getloadavg()[0]:.1f} at the start"
+    cores = len(os.sched_getaffinity(0))
+    return f"{cores} cores, {processor_name()}, load {os.getloadavg()[0]:.1f} at the start"

@@ -7,7 +7,6 @@ python docs/build_environment.py --check   # fail if the file is out of date
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +14,11 @@ from typing import Any
 
 import gymnasium
 import tyro
+from sections import table, write_or_check
 
 import tslam_bench  # noqa: F401  (registers the environment)
 from tslam_bench.cli.environments import action_rows, environment_rows, observation_rows, reward_rows
 from tslam_bench.constants import ENVIRONMENT_ID, TABLETOP_ID
-from tslam_bench.files import atomic_file
 from tslam_bench.hand_constants import SKIN_LINKS
 
 TARGET = Path(__file__).parent / "environment.md"
@@ -33,11 +32,9 @@ class Config:
     """Only compare; exit with status 1 if the file is out of date."""
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
-    lines += ["| " + " | ".join(_cell(value) for value in row.values()) + " |" for row in rows]
-    return "\n".join(lines)
+def rows_table(rows: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table of rows with the same keys."""
+    return table(list(rows[0]), [[_cell(value) for value in row.values()] for row in rows]).strip()
 
 
 def _cell(value: Any) -> str:
@@ -59,7 +56,7 @@ def page() -> str:
         "# Environment",
         "<!-- Written by docs/build_environment.py: change the code, not this page. -->",
         "## Registered ids",
-        table(environment_rows()),
+        rows_table(environment_rows()),
         f"## `{ENVIRONMENT_ID}`",
         f"```text\n{manual}\n```",
         f"## `{TABLETOP_ID}`",
@@ -68,25 +65,19 @@ def page() -> str:
         "Per environment; every value is batched `(num_envs, ...)`. `touch` follows the order of the skin links: "
         + ", ".join(f"`{name}`" for name in SKIN_LINKS)
         + ".",
-        table(observations),
+        rows_table(observations),
         "## Actions",
         "One number in [-1, 1] per joint. `delta_per_step` is the change of the target at action 1 in `pd_joint_delta_pos`.",
-        table(action_rows()),
+        rows_table(action_rows()),
         "## Reward modes",
-        table(reward_rows()),
+        rows_table(reward_rows()),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def main(config: Config) -> None:
     """Writes the page, or compares it."""
-    text = page()
-    if config.check:
-        if not TARGET.exists() or TARGET.read_text(encoding="utf-8") != text:
-            sys.exit("docs/environment.md is out of date; run 'python docs/build_environment.py'")
-        return
-    with atomic_file(TARGET) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_or_check({TARGET: page()}, config.check)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,8 @@ python docs/build_objects.py --check     # fail if a table is out of date
 from __future__ import annotations
 
 import re
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ from typing import Any
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from sections import filled, table, write_or_check
 
-from tslam_bench.files import atomic_file
 from tslam_bench.objects import splits, store
 from tslam_bench.preparation import manifest
 from tslam_bench.preparation.decompose import EXCEPTIONS, STANDARD, settings_for
@@ -55,12 +54,6 @@ class Config:
     """Only compare the tables; exit with status 1 if one is out of date."""
     sheets: bool = True
     """Also draw the contact sheets."""
-
-
-def table(heading: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(heading) + " |", "|" + "---|" * len(heading)]
-    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
 
 
 def objects_table(manifests: Manifests) -> str:
@@ -220,8 +213,8 @@ def categories_table(manifests: Manifests) -> str:
 def training_gates_table(manifests: Manifests) -> str:
     """What the gates say about train and val."""
     columns = []
-    filled = [split for split in ("train", "val") if manifests[split]["objects"]]
-    for split in filled:
+    kept = [split for split in ("train", "val") if manifests[split]["objects"]]
+    for split in kept:
         records = manifests[split]["objects"]
         iou = np.array([r["gates"]["hull_iou"] for r in records])
         hulls = np.array([r["hull_count"] for r in records])
@@ -252,7 +245,7 @@ def training_gates_table(manifests: Manifests) -> str:
         "largest overlap with a test object",
         "on disk",
     ]
-    return table(["", *filled], [list(row) for row in zip(names, *columns, strict=True)])
+    return table(["", *kept], [list(row) for row in zip(names, *columns, strict=True)])
 
 
 def rejections_table(manifests: Manifests) -> str:
@@ -294,17 +287,6 @@ SECTIONS: dict[str, Callable[[Manifests], str]] = {
 }
 
 
-def fill(text: str, manifests: Manifests) -> str:
-    """The page with every table between its markers renewed."""
-    for name, make in SECTIONS.items():
-        pattern = re.compile(rf"(<!-- {name}: written by docs/build_objects.py -->\n).*?(<!-- end -->)", re.DOTALL)
-        if not pattern.search(text):
-            raise SystemExit(f"{PAGE}: no place for table {name!r}")
-        table_text = make(manifests)
-        text = pattern.sub(lambda match, body=table_text: f"{match[1]}{body}\n{match[2]}", text)
-    return text
-
-
 def _prepared_panels(split: str, names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.float64], NDArray[np.int64]]]:
     """(caption, vertices, faces) of prepared objects."""
     for name in names:
@@ -344,13 +326,8 @@ def draw_sheets() -> None:
 def main(config: Config) -> None:
     """Writes or checks the page."""
     manifests = {split: manifest.read(MANIFESTS / f"manifest_{split}.json") for split in splits.SPLITS}
-    old = PAGE.read_text(encoding="utf-8")
-    new = fill(old, manifests)
-    if config.check:
-        sys.exit(f"{PAGE} is out of date; run python docs/build_objects.py" if old != new else 0)
-    with atomic_file(PAGE) as temporary:
-        temporary.write_text(new, encoding="utf-8")
-    if config.sheets:
+    write_or_check({PAGE: filled(PAGE, {name: make(manifests) for name, make in SECTIONS.items()})}, config.check)
+    if config.sheets and not config.check:
         draw_sheets()
 
 

@@ -16,9 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 import tyro
+from sections import filled, write_or_check
 
 from tslam_bench.errors import BenchmarkError, InvalidInputError
-from tslam_bench.files import atomic_file, write_json
+from tslam_bench.files import write_json
 
 ROOT: Final = Path(__file__).parent.parent
 KEPT: Final = ROOT / "leaderboard" / "results" / "scripted.json"
@@ -135,7 +136,7 @@ def score_table(kept: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -
     return "\n".join(lines)
 
 
-def sections(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
+def texts_of(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
     """Page -> section -> text."""
     short = [entry for entry in kept["entries"] if entry["reconstructor"] in README_RECONSTRUCTORS]
     return {
@@ -144,43 +145,16 @@ def sections(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
     }
 
 
-def filled(page: Path, texts: Mapping[str, str]) -> str:
-    """The page's text with its sections replaced.
-
-    Raises:
-        InvalidInputError: the page lacks a section.
-    """
-    content = page.read_text(encoding="utf-8")
-    for name, text in texts.items():
-        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-        if content.count(begin) != 1 or content.count(end) != 1:
-            raise InvalidInputError(f"{page}: needs exactly one line {begin!r} and one {end!r}")
-        before, rest = content.split(begin)
-        content = f"{before}{begin}\n{text.strip()}\n{end}{rest.split(end)[1]}"
-    return content
-
-
 def main(config: Config) -> None:
     """Keeps figures, writes or compares pages."""
     try:
         if config.run is not None:
             write_json(KEPT, kept_figures(config.run))
         kept = json.loads(KEPT.read_text(encoding="utf-8"))
-        stale = []
-        for page, texts in sections(kept).items():
-            content = filled(page, texts)
-            if content == page.read_text(encoding="utf-8"):
-                continue
-            stale.append(page.name)
-            if not config.check:
-                with atomic_file(page) as temporary:
-                    temporary.write_text(content, encoding="utf-8")
+        write_or_check({page: filled(page, texts) for page, texts in texts_of(kept).items()}, config.check)
     except BenchmarkError as error:
         print(f"build_results: {error}", file=sys.stderr)
         sys.exit(2)
-    if config.check and stale:
-        print(f"{', '.join(stale)}: out of date; run python docs/build_results.py", file=sys.stderr)
-        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEAVES = ("tasks", "baselines", "leaderboard")
-BASE = ("constants", "errors", "files", "grids", "hand_constants", "episodes", "variants", "version")
+BASE = ("constants", "errors", "files", "grids", "hand_constants", "machine", "episodes", "variants", "version")
 """Modules of the library that lie in no folder and that everything may import."""
 ALLOWED: dict[str, set[str]] = {
     "base": set(),

@@ -58,13 +58,6 @@ def test_the_hole_of_a_torus_stays_open_and_equal_seeds_give_equal_bytes():
     assert decompose.intersection_over_union(union, torus) > 0.85
 
 
-def test_packing_is_undone_by_unpacking():
-    cube, ball = from_manifold(Manifold.cube([1, 2, 3])), from_manifold(Manifold.sphere(1.0, 8))
-    for before, after in zip([cube, ball], decompose.unpack_hulls(*decompose.pack_hulls([cube, ball])), strict=True):
-        np.testing.assert_array_equal(before.vertices, after.vertices)
-        np.testing.assert_array_equal(before.faces, after.faces)
-
-
 def test_the_cache_is_used_and_survives_damage(tmp_path):
     mesh = from_manifold(Manifold.cube([0.1, 0.05, 0.04]))
     hulls = decompose.decompose_cached(mesh, QUICK, tmp_path)

@@ -60,18 +60,6 @@ class TrainingShape:
         return np.asarray(self.lookup[index[..., 0], index[..., 1], index[..., 2]])
 
 
-def winding_inside(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray[np.bool_]:
-    """Whether ``points`` (M, 3) lie inside a watertight mesh: (M,) bool, by libigl's fast winding number."""
-    import igl
-
-    winding = igl.fast_winding_number(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(faces, dtype=np.int64),
-        np.ascontiguousarray(points, dtype=np.float64),
-    )
-    return np.asarray(winding).reshape(-1) > 0.5
-
-
 def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.random.Generator) -> TrainingShape:
     """Samples a watertight mesh, (V, 3) in metres and (F, 3).
 
@@ -79,6 +67,9 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
         InvalidInputError: the mesh has no area, is not finite, or does not fit into W.
     """
     from scipy.spatial import ConvexHull, QhullError
+
+    from tslam_bench.geometry.distance import contains
+    from tslam_bench.geometry.meshes import TriangleMesh
 
     vertices = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(faces, dtype=np.int64)
@@ -112,7 +103,8 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
     box_points = half_extents * generator.uniform(-1, 1, (BOX_POINTS, 3))
     axes = [np.arange(-h, h + LOOKUP_SPACING, LOOKUP_SPACING) for h in half_extents]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    lookup = winding_inside(vertices, faces, lattice.reshape(-1, 3)).reshape(lattice.shape[:3])
+    mesh = TriangleMesh(vertices, faces)
+    lookup = contains(lattice.reshape(-1, 3), mesh).reshape(lattice.shape[:3])
     return TrainingShape(
         name=name,
         half_extents=half_extents,
@@ -120,9 +112,9 @@ def training_shape(name: str, vertices: NDArray, faces: NDArray, generator: np.r
         surface_points=surface_points,
         surface_normals=face_normals(triangles[chosen]),
         box_points=box_points,
-        box_inside=winding_inside(vertices, faces, box_points),
+        box_inside=contains(box_points, mesh),
         near_points=near_points,
-        near_inside=winding_inside(vertices, faces, near_points.reshape(-1, 3)).reshape(near_points.shape[:2]),
+        near_inside=contains(near_points.reshape(-1, 3), mesh).reshape(near_points.shape[:2]),
         lookup=np.pad(lookup, 1),
     )
 

@@ -163,7 +163,7 @@ def _bake(scene: trimesh.Scene, merge: bool) -> tuple[np.ndarray, np.ndarray]:
             )
         shown.append((geometry, transform))
     if not shown:
-        raise AssetError("holds no triangles")
+        raise AssetError("holds no triangles; it may be damaged, or of another kind than its name says")
     vertices, faces, offset = [], [], 0
     if merge:
         for geometry in {id(geometry): geometry for geometry, _ in shown}.values():

@@ -47,7 +47,7 @@ def _counterclockwise(polygon: NDArray[np.float64]) -> NDArray[np.float64]:
     return polygon[::-1] if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0 else polygon
 
 
-def vessel(profile: ArrayLike, wall: float, floor: float | None = None, segments: int = SEGMENTS) -> Manifold:
+def vessel(profile: ArrayLike, wall: float, floor: float | None = None) -> Manifold:
     """An open vessel: the turned ``profile`` (radius, z) minus the same profile moved in by ``wall``, above a ``floor``."""
     outer = np.asarray(profile, dtype=float)
     floor = wall if floor is None else floor
@@ -59,10 +59,10 @@ def vessel(profile: ArrayLike, wall: float, floor: float | None = None, segments
     slant = np.clip(np.abs(normal[:, 0]), 0.35, 1.0)  # horizontal thickness of a slanting wall
     inner_radius = np.interp(z, outer[:, 1], outer[:, 0] - wall / slant)
     if inner_radius.max() <= 0.05 * outer[:, 0].max():
-        return lathe(outer, segments)
+        return lathe(outer)
     inner = np.column_stack([np.maximum(inner_radius, 1e-3), z])
     inner = np.vstack([inner, [inner[-1, 0], top + wall]])
-    return lathe(outer, segments) - lathe(inner, segments)
+    return lathe(outer) - lathe(inner)
 
 
 def circle(radius: float, segments: int = 24) -> NDArray[np.float64]:
@@ -157,9 +157,9 @@ def box(x: float, y: float, z: float, radius: float = 0.0) -> Manifold:
     return Manifold.batch_hull([corner.translate(sign * core) for sign in signs])
 
 
-def ellipsoid(x: float, y: float, z: float, segments: int = 40) -> Manifold:
+def ellipsoid(x: float, y: float, z: float) -> Manifold:
     """An ellipsoid with the given semi-axes, centred on the origin."""
-    return Manifold.sphere(1.0, segments).scale([x, y, z])
+    return Manifold.sphere(1.0, 40).scale([x, y, z])
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None) -> Manifold:

@@ -1,9 +1,10 @@
-"""README, CONTRIBUTING and docs/: the files, links and examples that they name are there, and so are all pages in the site's menu."""
+"""README, CONTRIBUTING and docs/: files and links that they name exist, tables have headers, every page is in the site's menu."""
 
 from __future__ import annotations
 
 import re
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,11 @@ def text_of(name: str) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of a page's headings, made as GitHub makes them."""
-    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    """Anchors of a page's headings, made as GitHub makes them; a page may be another file, included."""
+    text = page.read_text(encoding="utf-8")
+    if included := re.fullmatch(r'--8<-- "([\w.]+)"\n', text):
+        text = text_of(included.group(1))
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
@@ -49,7 +53,7 @@ def test_files_that_are_named_exist(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_tables_have_headers(name: str) -> None:
     lines = ["", *text_of(name).splitlines()]
-    for above, line in zip(lines, lines[1:], strict=False):
+    for above, line in pairwise(lines):
         if re.fullmatch(r"\|(?:\s*:?-+:?\s*\|)+", line):
             cells = [cell.strip() for cell in above.strip("|").split("|")]
             assert any(cells), f"{name}: a table without headers"
@@ -62,7 +66,7 @@ def test_every_page_is_in_the_menu_once() -> None:
     Loader.add_multi_constructor("!", lambda loader, suffix, node: None)
     menu = yaml.load(text_of("mkdocs.yml"), Loader)["nav"]
     listed = [page for section in menu for pages in section.values() for page in pages]
-    assert sorted(listed) == [page.name for page in PAGES if page.parent.name == "docs"]
+    assert sorted(listed) == [name.removeprefix("docs/") for name in NAMES if name.startswith("docs/")]
 
 
 def test_the_citation_names_this_version() -> None:

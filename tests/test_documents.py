@@ -15,7 +15,7 @@ import tslam_bench
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
-FOLDERS = "tslam_bench|tasks|baselines|leaderboard|assets|tests|docs|benchmarks|examples"
+FOLDERS = "tslam_bench|tasks|baselines|leaderboard|assets|tests|docs|benchmarks"
 PATH = re.compile(rf"(?<![\w/.<>-])((?:{FOLDERS})/[\w/.-]*\.(?:py|sh|md|json|yml|png))\b")
 
 
@@ -67,6 +67,11 @@ def test_every_page_is_in_the_menu_once() -> None:
     menu = yaml.load(text_of("mkdocs.yml"), Loader)["nav"]
     listed = [page for section in menu for pages in section.values() for page in pages]
     assert sorted(listed) == [name.removeprefix("docs/") for name in NAMES if name.startswith("docs/")]
+
+
+def test_every_example_is_shown() -> None:
+    shown = re.findall(r'^--8<-- "(examples/.*)"$', text_of("docs/examples.md"), re.MULTILINE)
+    assert {path.relative_to(ROOT).as_posix() for path in (ROOT / "examples").glob("*.py")} <= set(shown)
 
 
 def test_the_citation_names_this_version() -> None:

@@ -38,6 +38,8 @@ step "$PYTHON" -m tslam_bench.cli assets prepare --quick
 step "$PYTHON" -m tslam_bench.cli assets prepare --objects cubemedium cubesmall  # of the fidelity tests
 step "$PYTHON" docs/build_environment.py --check
 step "$PYTHON" docs/build_results.py --check
+step "$PYTHON" docs/build_objects.py --check
+step "$PYTHON" docs/build_gpu.py --check
 if [ $# -eq 0 ]; then  # a chosen test needs no run of the whole chain
     tiny="$(mktemp -d)"
     trap 'rm -rf "$tiny"' EXIT

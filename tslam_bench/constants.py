@@ -1,4 +1,4 @@
-"""The benchmark's constants: each number of the protocol has its one home here.
+"""The protocol's constants that more than one part reads; those of hand, physics, skin and rewards stand beside what they rule.
 
 Section numbers refer to the protocol definition (``docs/protocol.md``). Units are metres, radians and seconds.
 This module imports nothing, so that scoring can read it without a simulator.

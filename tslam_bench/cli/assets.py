@@ -44,7 +44,7 @@ class Prepare:
     count: int | None = None
     """Stop at this many train or val objects."""
     manifest: Path | None = None
-    """Prepare a set of your own instead: a JSON file that lists its meshes (see docs/objects.md)."""
+    """Prepare a set of your own instead: a JSON file that lists its meshes (see docs/importing.md)."""
     workers: int = 2
     """Processes."""
     time_limit: float = 900.0

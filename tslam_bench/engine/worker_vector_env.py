@@ -13,18 +13,18 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
-from tslam_bench.engine.hand_batch import FINAL, OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
+from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.engine.hand_batch import FINAL, BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.spaces import OBSERVATION_ARRAYS, action_space, observation_space
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
-from tslam_bench.hand_constants import JOINT_NAMES, SKIN_LINKS
+from tslam_bench.hand_constants import JOINT_NAMES
 
 MAX_ENVIRONMENTS: Final = 4096
-"""More environments than this in one machine's memory are a slip of the pen."""
+"""More environments than this on one machine are probably a mistake."""
 STEP_TIMEOUT: Final = 60.0
 """Seconds after which a worker that has not answered counts as hung."""
 START_TIMEOUT: Final = 300.0
@@ -33,20 +33,6 @@ START_TIMEOUT: Final = 300.0
 
 class WorkerError(BenchmarkError, RuntimeError):
     """A worker process died, hung, or raised something unforeseen."""
-
-
-def observation_space() -> spaces.Dict:
-    """Observation space of one environment (protocol section 6)."""
-    unbounded = np.full(NUM_JOINTS, np.inf, dtype=np.float32)
-    return spaces.Dict(
-        {
-            "qpos": spaces.Box(-unbounded, unbounded),
-            "qvel": spaces.Box(-unbounded, unbounded),
-            "touch": spaces.Box(0, 1, (len(SKIN_LINKS),), np.uint8),
-            "occupancy": spaces.Box(0, 1, (2, GRID_SIZE, GRID_SIZE, GRID_SIZE), np.uint8),
-            "time": spaces.Box(0.0, 1.0, (1,), np.float32),
-        }
-    )
 
 
 class TactileVectorEnv(VectorEnv):
@@ -97,7 +83,7 @@ class TactileVectorEnv(VectorEnv):
             settings = replace(settings, objects=self._starts.names)
         self.num_envs = int(num_envs)
         self.single_observation_space = observation_space()
-        self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
+        self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.closed = False

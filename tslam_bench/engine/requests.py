@@ -89,7 +89,7 @@ def check_reset(seed: Any, options: Mapping[str, Any] | None, num_envs: int, kno
         if name is not None:
             known.check_name(name)
     checked = None if poses is None else [known.variant.check_pose(pose) for pose in poses]
-    return ResetRequest(check_seeds(seed, num_envs), objects, checked, _check_mask(options, num_envs))
+    return ResetRequest(check_seeds(seed, num_envs), objects, checked, check_mask(options, num_envs))
 
 
 def check_seeds(seed: Any, num_envs: int) -> list[int | None]:
@@ -99,7 +99,8 @@ def check_seeds(seed: Any, num_envs: int) -> list[int | None]:
     return [None if value is None else int(value) for value in _one_each("seed", list(seed), num_envs)]
 
 
-def _check_mask(options: Mapping[str, Any], num_envs: int) -> NDArray[np.bool_]:
+def check_mask(options: Mapping[str, Any], num_envs: int) -> NDArray[np.bool_]:
+    """(E,) bool, which environments ``options`` ask to reset; all without ``reset_mask``."""
     mask = np.asarray(options.get("reset_mask", np.ones(num_envs, dtype=bool)))
     if mask.shape != (num_envs,) or mask.dtype != bool:
         raise InvalidInputError(f"options['reset_mask']: shape {mask.shape} {mask.dtype}; give ({num_envs},) bool")

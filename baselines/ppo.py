@@ -199,7 +199,7 @@ class PPO:
                 self._observation, reward, terminated, truncated, info = result
             end = self._tensor(terminated).bool() | self._tensor(truncated).bool()
             reward = self._tensor(reward).float().clone()  # the environments' memory may be written again
-            count = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
+            count = [self._count(info, end, name) for name in COUNTS]
             kept.append((action, drawn_with, value, reward, end, torch.stack(count, dim=1)))
             self.steps += self.config.action_repeat * self.environments.num_envs
             if on_progress is not None:
@@ -212,6 +212,15 @@ class PPO:
 
     def _encode(self) -> Encoded:
         return self.network.encode({key: self._tensor(value) for key, value in self._observation.items()})
+
+    def _count(self, info: dict[str, Any], end: Tensor, name: str) -> Tensor:
+        """(n,) an entry of ``info`` or zeros; where an episode ended it is in ``final_info``."""
+        if name not in info:
+            return torch.zeros(len(end), device=self.device)
+        count = self._tensor(info[name]).float()
+        return (
+            torch.where(end, self._tensor(info["final_info"][name]).float(), count) if "final_info" in info else count
+        )
 
     def _tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, device=self.device)

@@ -77,10 +77,9 @@ class TactileVecEnv(VecEnv):
             {"TimeLimit.truncated": bool(t and not e)} for t, e in zip(truncated, terminated, strict=True)
         ]
         if done.any():
-            final = observation_to_numpy(info["final_obs"])
             for i in np.flatnonzero(done).tolist():
                 infos[i].update(_info_of(info["final_info"], i))
-                infos[i]["terminal_observation"] = {key: value[i].copy() for key, value in final.items()}
+                infos[i]["terminal_observation"] = observation_to_numpy(info["final_obs"][i])
                 self.reset_infos[i] = _info_of(info, i)
         return observation_to_numpy(observation), to_numpy(reward).astype(np.float32), done, infos
 
@@ -124,11 +123,11 @@ def _byte_or_float_space(space: spaces.Space) -> spaces.Dict:
 
 
 def _info_of(info: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Environment ``index``'s share of a batched info: entries of shape (n,) as Python numbers."""
+    """Environment ``index``'s share of a batched info: numbers (n,) as Python numbers."""
     own: dict[str, Any] = {}
     for key, value in info.items():
         if key.startswith("_"):
             continue
-        if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 1 and len(value) > index:
+        if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 1 and value.dtype != object:
             own[key] = value[index].item()
     return own

@@ -31,6 +31,7 @@ from tqdm import tqdm
 import tslam_bench
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import BenchmarkError
+from tslam_bench.evaluation.observations import last_observation
 from tslam_bench.objects.store import list_objects
 
 SAMPLES: Final = 20
@@ -100,14 +101,16 @@ class Watch:
             ended = info.get("_final_obs")
             if ended is not None:
                 self.episodes += int(ended.sum())
-                note("final observation not finite", ended & ~np.isfinite(info["final_obs"]["qpos"]).all(axis=1))
+                last = last_observation(observation, info)
+                note("final observation not finite", ended & ~np.isfinite(last["qpos"]).all(axis=1))
                 note("episode ended early", ended & (info["final_info"]["elapsed_steps"] != HORIZON))
                 note("grids not empty after a reset", ended & (count != 0).any(axis=1))
         self._occupied = count
 
     def see_tslam_reward(self, reward: NDArray, info: dict[str, Any], weight: float) -> None:
         """Checks the default mode's reward against its definition."""
-        expected = info["new_touched"] + weight * info["new_visited"]
+        counts = [info[name] + info.get("final_info", {}).get(name, 0) for name in ("new_touched", "new_visited")]
+        expected = counts[0] + weight * counts[1]
         self._note("reward is not its definition", np.abs(reward - expected) > 1e-3)
 
     def _note(self, kind: str, wrong: NDArray) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS
-from tslam_bench.engine import hand_batch, physics, worker_vector_env
+from tslam_bench.engine import hand_batch, hand_workers, physics, worker_vector_env
 from tslam_bench.engine.starts import Start
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
@@ -201,7 +201,7 @@ def mujoco_batches(settings: MujocoSettings) -> Iterator[None]:
         yield
 
 
-_ENGINE_WORK: Final = worker_vector_env._work
+_ENGINE_WORK: Final = hand_workers._work
 
 
 def _work(settings: MujocoSettings, *arguments: Any) -> None:
@@ -216,5 +216,5 @@ def make_mujoco_vec(
     mujoco_settings: MujocoSettings | None = None,
 ) -> worker_vector_env.TactileVectorEnv:
     """``TactileVectorEnv`` whose workers simulate with MuJoCo; everything else is the engine's own code."""
-    with mock.patch.object(worker_vector_env, "_work", partial(_work, mujoco_settings or MujocoSettings())):
+    with mock.patch.object(hand_workers, "_work", partial(_work, mujoco_settings or MujocoSettings())):
         return worker_vector_env.TactileVectorEnv(num_envs, settings, processes)

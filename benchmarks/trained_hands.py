@@ -22,7 +22,8 @@ from rollouts import Hands, run_episode
 from separation import SeparationRuler
 
 from tslam_bench.constants import NUM_POSES
-from tslam_bench.engine.hand_batch import OBSERVATION_ARRAYS, BatchSettings
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.spaces import OBSERVATION_ARRAYS
 from tslam_bench.evaluation.policies import make_baseline
 from tslam_bench.evaluation.policy import Baseline
 

@@ -17,8 +17,9 @@ import tyro
 from sections import table, write_or_check
 
 import tslam_bench  # noqa: F401  (registers the environment)
-from tslam_bench.cli.environments import action_rows, environment_rows, observation_rows, reward_rows
+from tslam_bench.cli.environments import action_rows, environment_rows, reward_rows
 from tslam_bench.constants import ENVIRONMENT_ID, TABLETOP_ID
+from tslam_bench.engine.spaces import observation_rows
 from tslam_bench.hand_constants import SKIN_LINKS
 
 TARGET = Path(__file__).parent / "environment.md"
@@ -40,14 +41,15 @@ def rows_table(rows: Sequence[dict[str, Any]]) -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else f"`{value}`" if isinstance(value, str) else str(value)
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"`{value}`" if isinstance(value, str) and " " not in value else str(value)  # names, not sentences
 
 
 def page() -> str:
     """The page's text."""
     environment = gymnasium.make(ENVIRONMENT_ID, object="mug")
     manual = inspect.cleandoc(type(environment.unwrapped).__doc__ or "")
-    observations = observation_rows(environment)
     environment.close()
     tabletop = gymnasium.make(TABLETOP_ID, object="mug")
     tabletop_manual = inspect.cleandoc(type(tabletop.unwrapped).__doc__ or "")
@@ -65,7 +67,7 @@ def page() -> str:
         "Per environment; every value is batched `(num_envs, ...)`. `touch` follows the order of the skin links: "
         + ", ".join(f"`{name}`" for name in SKIN_LINKS)
         + ".",
-        rows_table(observations),
+        rows_table(observation_rows()),
         "## Actions",
         "One number in [-1, 1] per joint. `delta_per_step` is the change of the target at action 1 in `pd_joint_delta_pos`.",
         rows_table(action_rows()),

@@ -21,12 +21,10 @@ from sapien import physx
 
 from tslam_bench.constants import (
     CONTROL_STEP_SECONDS,
-    GRID_SIZE,
     HORIZON,
     NUM_JOINTS,
-    REWARD_MODES,
 )
-from tslam_bench.engine import physics
+from tslam_bench.engine import physics, requests
 from tslam_bench.engine.arrays import Backend, NumpyBackend, TorchBackend
 from tslam_bench.engine.gpu_memory import gpu_memory
 from tslam_bench.engine.hand_agent import AdroitHand
@@ -35,12 +33,12 @@ from tslam_bench.engine.rewards import Rewards
 from tslam_bench.engine.sensing import Contacts, TactileSensing
 from tslam_bench.engine.sensing_numba import CompiledSensing
 from tslam_bench.engine.skin import build_skin
+from tslam_bench.engine.spaces import observation_space
 from tslam_bench.engine.starts import StartSampler
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import (
     CONTROL_MODES,
     JOINT_NAMES,
-    SKIN_LINKS,
 )
 from tslam_bench.objects.hand import load_hand
 from tslam_bench.objects.store import PreparedObject
@@ -96,7 +94,7 @@ class TactileSLAMEnv(BaseEnv):
 
     SUPPORTED_ROBOTS = ("adroit28",)
     SUPPORTED_OBS_MODES = ("state_dict", "state", "none", "sensor_data", "any_textures", "pointcloud")
-    SUPPORTED_REWARD_MODES = (*REWARD_MODES, "none")
+    SUPPORTED_REWARD_MODES = requests.ENVIRONMENT_REWARD_MODES
     VARIANT: ClassVar[Variant] = FREE
     agent: AdroitHand
 
@@ -116,12 +114,8 @@ class TactileSLAMEnv(BaseEnv):
         robot_uids: str = "adroit28",
         **kwargs: Any,
     ) -> None:
-        if reward_mode not in self.SUPPORTED_REWARD_MODES:
-            raise InvalidInputError(
-                f"reward_mode {reward_mode!r}: unknown; choose one of {', '.join(self.SUPPORTED_REWARD_MODES)}"
-            )
-        if control_mode not in CONTROL_MODES:
-            raise InvalidInputError(f"control_mode {control_mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
+        requests.check_reward_mode(reward_mode)
+        requests.check_control_mode(control_mode)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise InvalidInputError(f"num_envs {num_envs!r}: must be a whole number of at least 1")
         wants_gpu = num_envs > 1 or "cuda" in str(kwargs.get("sim_backend", ""))
@@ -207,16 +201,7 @@ class TactileSLAMEnv(BaseEnv):
         """The unbatched observation space."""
         if self._obs_mode != "state_dict":
             return super().single_observation_space
-        unbounded = np.full(NUM_JOINTS, np.inf, dtype=np.float32)
-        return spaces.Dict(
-            {
-                "qpos": spaces.Box(-unbounded, unbounded),
-                "qvel": spaces.Box(-unbounded, unbounded),
-                "touch": spaces.Box(0, 1, (len(SKIN_LINKS),), np.uint8),
-                "occupancy": spaces.Box(0, 1, (2, GRID_SIZE, GRID_SIZE, GRID_SIZE), np.uint8),
-                "time": spaces.Box(0.0, 1.0, (1,), np.float32),
-            }
-        )
+        return observation_space()
 
     # -- scene ------------------------------------------------------------------------------------------------
     def _setup_scene(self) -> None:

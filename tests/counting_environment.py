@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -71,10 +72,12 @@ class Counter(VectorEnv):
         reward, never = self.pay(), torch.zeros_like(ended)
         info: dict[str, Any] = {"elapsed": self.steps.clone()}
         if ended.any():
-            final = {key: value.clone() for key, value in self._observe().items()} if self.tensors else None
-            info["final_obs"] = final or {key: value.copy() for key, value in self._observe().items()}
-            info["final_info"] = {"elapsed": self.steps.clone()}
+            observation, final = self._observe(), np.full(self.num_envs, None, dtype=object)
+            for env in ended.nonzero()[:, 0].tolist():  # as SyncVectorEnv gives them
+                final[env] = {key: copy.deepcopy(value[env]) for key, value in observation.items()}
+            info["final_obs"], info["final_info"] = final, {"elapsed": self.steps * ended, "_elapsed": ended}
             info["_final_obs"] = info["_final_info"] = ended
+            info["elapsed"] = info["elapsed"] * ~ended
             self.steps[ended] = 0
         terminated, truncated = (ended, never) if self.terminates else (never, ended)
         if self.tensors:

@@ -43,6 +43,9 @@ def make_vec(
 ) -> gymnasium.vector.VectorEnv:
     """A Gymnasium vector environment (1.x semantics, autoreset ``SAME_STEP``) of many hands.
 
+    ``gymnasium.make_vec(environment_id, num_envs, ...)`` is the same, with the same arguments by name. Its modes ``sync`` and
+    ``async`` are not meant for these environments: they batch what ManiSkill has batched already.
+
     On the CPU: scenes in worker processes, sensed as one batch per worker, observations as numpy arrays; bit for
     bit the episodes of ``gymnasium.make`` with the same seeds. On CUDA: ManiSkill's GPU simulation, observations as
     torch tensors on the device. *The CUDA path has not been run on a GPU yet.*
@@ -58,7 +61,8 @@ def make_vec(
         pose: one of the environment's poses for every episode; None draws.
         reward_mode: see the environment.
         control_mode: see the environment.
-        processes: CPU worker processes; None means the cores.
+        processes: CPU worker processes; None means the cores, 0 steps in the caller's own process (notebooks, daemonic pools,
+            debuggers), with the same bits.
         timeout: seconds after which a CPU worker that does not answer a step counts as hung.
         action_repeat: control steps that a step holds its action for, a divisor of the horizon; rewards are added up.
 
@@ -116,6 +120,7 @@ def register_environments() -> None:
         gymnasium.register(
             environment_id,
             entry_point="tslam_bench.registration:make_environment",
+            vector_entry_point="tslam_bench.registration:make_vec",
             disable_env_checker=True,  # ManiSkill environments return batched tensors, which the checker refuses
             kwargs={"environment_id": environment_id},
         )

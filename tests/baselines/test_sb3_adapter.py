@@ -241,6 +241,11 @@ def compare(a, b, where: str) -> None:
     elif isinstance(a, tuple):
         for one, other in zip(a, b, strict=True):
             compare(one, other, where)
+    elif isinstance(a, np.ndarray):  # final_obs: an observation or None per environment
+        assert a.dtype == b.dtype == object and a.shape == b.shape, where
+        compare(tuple(a), tuple(b), where)
+    elif a is None:
+        assert b is None, where
     else:
         assert isinstance(a, torch.Tensor), where
         np.testing.assert_array_equal(a.numpy(), b, err_msg=where)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,6 +11,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import FrameType
 
 import gymnasium as gym
 import numpy as np
@@ -17,10 +20,18 @@ import torch
 
 import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, TABLETOP_ID
-from tslam_bench.engine.worker_vector_env import WorkerError
+from tslam_bench.engine.hand_workers import WorkerError
 from tslam_bench.errors import InvalidInputError
 
 OBJECTS = ("mug", "hammer", "toruslarge")
+
+
+COUNTS = ("new_touched", "new_visited")
+
+
+def counted(info: dict, name: str) -> np.ndarray:
+    """What a step counted: that of an ended episode is in ``final_info``."""
+    return info[name] + info["final_info"][name] if "final_info" in info else info[name]
 
 
 def actions_of(seed: int, steps: int) -> np.ndarray:
@@ -60,13 +71,14 @@ def test_bit_for_bit_the_maniskill_task_over_episodes_objects_and_poses(environm
                 expected, expected_reward, _, expected_truncated, expected_info = single.step(actions[step - 1, env])
                 assert reward[env] == expected_reward.numpy()[0]
                 assert truncated[env] == expected_truncated.numpy()[0]
-                assert info["new_touched"][env] == int(expected_info["new_touched"])
-                assert info["new_visited"][env] == int(expected_info["new_visited"])
+                own_info = info["final_info"] if truncated[env] else info
+                assert own_info["new_touched"][env] == int(expected_info["new_touched"])
+                assert own_info["new_visited"][env] == int(expected_info["new_visited"])
                 if truncated[env]:
-                    final = info["final_obs"]
+                    final = info["final_obs"][env]
                     for key, value in expected.items():
-                        np.testing.assert_array_equal(final[key][env], value[0].numpy(), err_msg=f"final {key}")
-                    touched += int(final["occupancy"][env, 0].sum())
+                        np.testing.assert_array_equal(final[key], value[0].numpy(), err_msg=f"final {key}")
+                    touched += int(final["occupancy"][0].sum())
                     expected, _ = single.reset()
             for key, value in expected.items():
                 np.testing.assert_array_equal(observation[key][env], value[0].numpy(), err_msg=f"{key}, step {step}")
@@ -91,23 +103,22 @@ def test_held_actions_are_bit_for_bit_single_steps(control_mode, reward_mode):
             for envs in (held, single):
                 envs.reset(options={"reset_mask": np.array([False, True, False])})
         observation, reward, terminated, truncated, info = held.step(actions[decision])
-        total, sums, final = np.zeros(num_envs, np.float32), dict.fromkeys(("new_touched", "new_visited"), 0), None
+        total, sums, final = np.zeros(num_envs, np.float32), dict.fromkeys(COUNTS, 0), None
         for step in range(repeat):
             expected, one, _, ended, expected_info = single.step(actions[decision])
             total += one
-            sums = {name: value + expected_info[name] for name, value in sums.items()}
+            sums = {name: value + counted(expected_info, name) for name, value in sums.items()}
             assert step == repeat - 1 or not ended.any()
             final = expected_info.get("final_obs")
         np.testing.assert_array_equal(reward, total)
         np.testing.assert_array_equal(truncated, ended)
         assert not terminated.any() and (final is None) == ("final_obs" not in info)
         for name, value in sums.items():
-            np.testing.assert_array_equal(info[name], value)
+            np.testing.assert_array_equal(counted(info, name), value)
         for key, value in expected.items():
             np.testing.assert_array_equal(observation[key], value)
-            if final is not None:
-                np.testing.assert_array_equal(info["final_obs"][key][ended], final[key][ended])
-                np.testing.assert_array_equal(info["final_info"]["new_touched"], info["new_touched"])
+            for env in np.flatnonzero(ended):
+                np.testing.assert_array_equal(info["final_obs"][env][key], final[env][key])
         ends += int(ended.sum())
     assert ends == num_envs  # at different times
     held.close()
@@ -119,7 +130,7 @@ def test_spaces_options_and_partial_resets():
     assert envs.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
     observation, info = envs.reset(seed=0, options={"object": ["hammer", "mug"], "pose": 6})
     assert envs.observation_space.contains(observation)
-    assert set(info) == {"elapsed_steps", "new_touched", "new_visited"}
+    assert {name for name in info if name[0] != "_"} == {"elapsed_steps", *COUNTS}
     state = envs.state()
     assert state["object_name"] == ["hammer", "mug"] and state["pose"] == [6, 6]
     for action in actions_of(0, 20):
@@ -129,6 +140,7 @@ def test_spaces_options_and_partial_resets():
     for key, value in kept.items():
         np.testing.assert_array_equal(observation[key][0], value, err_msg="the other environment goes on")
     assert info["elapsed_steps"].tolist() == [20, 0] and observation["occupancy"][1].sum() == 0
+    assert info["_elapsed_steps"].tolist() == [False, True]
     envs.close()
     with pytest.raises(WorkerError, match="closed"):
         envs.step(np.zeros((2, NUM_JOINTS), np.float32))
@@ -143,7 +155,8 @@ def test_spaces_options_and_partial_resets():
         ({"num_envs": 2.0}, r"num_envs 2\.0: must be a whole number"),
         ({"num_envs": True}, "num_envs True"),
         ({"num_envs": "many"}, "num_envs 'many'"),
-        ({"num_envs": 2, "processes": 0}, "processes 0"),
+        ({"num_envs": 2, "processes": -1}, "processes -1: must be a whole number from 0 to 256"),
+        ({"num_envs": 2, "processes": 2.0}, r"processes 2\.0"),
         ({"num_envs": 2, "timeout": 0}, "timeout 0: must be a number of seconds above 0"),
         ({"num_envs": 2, "device": "tpu"}, "device 'tpu': unknown"),
         ({"num_envs": 2, "action_repeat": 3}, "action_repeat 3: must divide the 200 steps of an episode"),
@@ -166,6 +179,90 @@ def test_bad_arguments_get_one_line(arguments, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("processes", [0, 1])
+def test_a_step_before_the_first_reset_gets_one_line(processes):
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=processes)
+    actions = np.zeros((2, NUM_JOINTS), np.float32)
+    with pytest.raises(InvalidInputError, match="step: no episode has begun; call reset first"):
+        envs.step(actions)
+    with pytest.raises(InvalidInputError, match="the first reset is of all environments"):
+        envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
+    envs.reset()
+    envs.step(actions)
+    envs.close()
+
+
+def digest_of_an_episode(processes: int | None) -> str:
+    """Hash of what three environments return past the end of their episodes, ManiSkill's own tasks beside them or not."""
+    envs = tslam_bench.make_vec(TABLETOP_ID, 3, "cpu", objects=OBJECTS, processes=processes, reward_mode="chamfer")
+    digest, touched = hashlib.sha256(), 0
+    observation, _ = envs.reset(seed=4)
+    for action in actions_of(3, HORIZON + 30):
+        observation, reward, _, truncated, info = envs.step(np.stack([action, -action, action[::-1]]))
+        for value in (*observation.values(), reward, truncated, *(counted(info, name) for name in COUNTS)):
+            digest.update(value.tobytes())
+        for final in info.get("final_obs", ()):
+            touched += int(final["occupancy"][0].sum())
+            for value in final.values():
+                digest.update(value.tobytes())
+    digest.update(envs.state()["touched_step"].tobytes())
+    envs.close()
+    assert touched > 20, "the comparison has to include contact"
+    return digest.hexdigest()
+
+
+def in_a_daemonic_process(_: int) -> tuple[bool, str, str]:
+    try:
+        tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug")
+        message = ""
+    except InvalidInputError as error:
+        message = str(error)
+    return multiprocessing.current_process().daemon, message, digest_of_an_episode(0)
+
+
+def test_the_caller_s_own_process_gives_the_same_bits_without_workers():
+    other = gym.make(ENVIRONMENT_ID, object="mug")  # SAPIEN's defaults are global: another task may have set them
+    other.reset(seed=0)
+    children = multiprocessing.active_children()
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 1, "cpu", object="mug", processes=0)
+    assert multiprocessing.active_children() == children
+    envs.close()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        daemonic, message, there = pool.map(in_a_daemonic_process, [0])[0]
+    assert daemonic and "give processes=0" in message and "\n" not in message
+    assert digest_of_an_episode(0) == digest_of_an_episode(2) == there
+    other.close()
+
+
+class Interruption(Exception):
+    """What the alarm raises."""
+
+
+def test_what_fails_in_the_caller_s_own_process_has_its_traceback_and_closes_the_environment():
+    """An alarm rings while the hands are stepped one by one: some are a step ahead of others, so nothing may go on."""
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 4, "cpu", object="mug", processes=0)
+    envs.reset(seed=0)
+
+    def ring(_: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if Path(frame.f_code.co_filename).name == "hand_batch.py":
+                raise Interruption
+            frame = frame.f_back
+        signal.setitimer(signal.ITIMER_REAL, 0.001)
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, 0.02)
+    try:
+        with pytest.raises(Interruption) as caught:
+            while True:
+                envs.step(np.zeros((4, NUM_JOINTS), np.float32))
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert "hand_batch.py" in {Path(entry.path).name for entry in caught.traceback}
+    with pytest.raises(WorkerError, match="closed"):
+        envs.reset()
+
+
 def test_bad_actions_and_dead_workers():
     envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
     envs.reset(seed=0)
@@ -181,7 +278,7 @@ def test_bad_actions_and_dead_workers():
         with pytest.raises(InvalidInputError, match=message):
             envs.step(bad)
     envs.step(good)  # refused actions harm nothing
-    processes = [process for process, _ in envs._workers]
+    processes = envs._hands.processes
     os.kill(processes[1].pid, signal.SIGKILL)
     started = time.monotonic()
     with pytest.raises(WorkerError, match=r"worker 1: died \(exit code -9\)"):
@@ -195,7 +292,7 @@ def test_bad_actions_and_dead_workers():
 def test_a_hung_worker_is_found_within_the_timeout(request_name):
     envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2, timeout=3.0)
     envs.reset(seed=0)
-    processes = [process for process, _ in envs._workers]
+    processes = envs._hands.processes
     os.kill(processes[0].pid, signal.SIGSTOP)
     started = time.monotonic()
     with pytest.raises(WorkerError, match="worker 0: no answer for 3 s; all workers were stopped") as caught:
@@ -252,7 +349,7 @@ def test_nothing_is_left_when_the_parent_is_killed():
         if __name__ == "__main__":
             envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=2)
             envs.reset(seed=0)
-            print(*[process.pid for process, _ in envs._workers], flush=True)
+            print(*[process.pid for process in envs._hands.processes], flush=True)
             time.sleep(60)
     """
     before = set(Path("/dev/shm").iterdir()) if Path("/dev/shm").exists() else set()

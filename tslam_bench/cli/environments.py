@@ -20,6 +20,7 @@ from tslam_bench.constants import (
     PRIVILEGED_REWARD_MODES,
     REWARD_MODES,
 )
+from tslam_bench.engine.spaces import observation_rows
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT, JOINT_LIMITS, JOINT_NAMES
 from tslam_bench.variants import VARIANTS, get_variant
@@ -35,12 +36,10 @@ class List:
 
 @dataclass(frozen=True)
 class Describe:
-    """Print the tables of actions, observations and reward modes, generated from the environment's spaces."""
+    """Print the tables of actions, observations and reward modes, generated from the environments' own constants."""
 
     environment: Annotated[str, tyro.conf.Positional] = ENVIRONMENT_ID
     """Environment id."""
-    object: str = "mug"
-    """A prepared object to make the environment with."""
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -125,21 +124,6 @@ def reward_rows() -> list[dict[str, Any]]:
     return [{"reward_mode": mode, "privileged": mode in PRIVILEGED_REWARD_MODES} for mode in REWARD_MODES]
 
 
-def observation_rows(environment: Any) -> list[dict[str, Any]]:
-    """One record per entry of the environment's single observation space."""
-    space = environment.unwrapped.single_observation_space
-    return [
-        {
-            "key": key,
-            "shape": list(box.shape),
-            "dtype": str(box.dtype),
-            "low": float(box.low.min()),
-            "high": float(box.high.max()),
-        }
-        for key, box in space.spaces.items()
-    ]
-
-
 def _print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
     table = Table(title=title)
     for index, heading in enumerate(rows[0]):
@@ -157,15 +141,12 @@ def _list(command: List) -> None:
 
 
 def _describe(command: Describe) -> None:
-    import gymnasium
-
-    environment = gymnasium.make(get_variant(command.environment).id, object=command.object)
+    get_variant(command.environment)  # all have the same spaces
     tables = {
-        "observations": observation_rows(environment),
+        "observations": observation_rows(),
         "actions": action_rows(),
         "reward modes": reward_rows(),
     }
-    environment.close()
     if command.json:
         print(json.dumps(tables, indent=2).replace("Infinity", "null"))
         return

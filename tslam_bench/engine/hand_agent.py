@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
-from gymnasium import spaces
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
 from mani_skill.agents.registration import register_agent
 
-from tslam_bench.constants import NUM_JOINTS
 from tslam_bench.engine import link_poses
 from tslam_bench.engine.arrays import Backend, NumpyBackend, TorchBackend
 from tslam_bench.engine.control import DriveTargets
+from tslam_bench.engine.spaces import action_space
 from tslam_bench.hand_constants import (
     ARMATURE,
     BASE_POSITION,
@@ -39,7 +38,7 @@ class HandController(BaseController):
     sets_target_qvel = False
 
     def _initialize_action_space(self) -> None:
-        self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
+        self.single_action_space = action_space()
         on_gpu = self.scene.gpu_sim_enabled
         self._arrays: Backend = TorchBackend(self.device) if on_gpu else NumpyBackend()
         self._targets = DriveTargets(self.config.mode, self._arrays)

@@ -9,30 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, HORIZON, NUM_JOINTS, REWARD_MODES
+from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS
 from tslam_bench.engine.arrays import NumpyBackend
 from tslam_bench.engine.control import DriveTargets
 from tslam_bench.engine.hand_scene import BodyPool, HandScene
 from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices
 from tslam_bench.engine.physics import PROTOCOL, PhysicsSettings
+from tslam_bench.engine.requests import check_control_mode, check_reward_mode
 from tslam_bench.engine.rewards import Rewards
 from tslam_bench.engine.sensing_numba import CompiledSensing
 from tslam_bench.engine.skin import build_skin
+from tslam_bench.engine.spaces import OBSERVATION_ARRAYS, ArraySpec
 from tslam_bench.engine.starts import StartSampler
-from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.errors import AssetError
 from tslam_bench.hand_constants import CONTROL_MODES, SKIN_LINKS
 from tslam_bench.objects.hand import load_hand
 from tslam_bench.variants import get_variant
 
-OBSERVATION_ARRAYS: dict[str, tuple[tuple[int, ...], type]] = {
-    "qpos": ((NUM_JOINTS,), np.float32),
-    "qvel": ((NUM_JOINTS,), np.float32),
-    "touch": ((len(SKIN_LINKS),), np.uint8),
-    "occupancy": ((2, GRID_SIZE, GRID_SIZE, GRID_SIZE), np.uint8),
-    "time": ((1,), np.float32),
-}
-"""Shape and type of each entry of one environment's observation."""
-STEP_ARRAYS: dict[str, tuple[tuple[int, ...], type]] = {
+STEP_ARRAYS: dict[str, ArraySpec] = {
     "reward": ((), np.float32),
     "truncated": ((), np.bool_),
     "new_touched": ((), np.int64),
@@ -46,7 +40,7 @@ FINAL = "final_"
 """Prefix of the arrays that hold an episode's last observation while its environment starts the next one."""
 
 
-def batch_arrays() -> dict[str, tuple[tuple[int, ...], type]]:
+def batch_arrays() -> dict[str, ArraySpec]:
     """Name, shape and type, per environment, of every array that a batch reads and writes."""
     final = {FINAL + name: spec for name, spec in OBSERVATION_ARRAYS.items()}
     return {"action": ((NUM_JOINTS,), np.float32), **OBSERVATION_ARRAYS, **final, **STEP_ARRAYS}
@@ -66,13 +60,8 @@ class BatchSettings:
     physics: PhysicsSettings = PROTOCOL
 
     def __post_init__(self) -> None:
-        known = (*REWARD_MODES, "none")
-        if self.reward_mode not in known:
-            raise InvalidInputError(f"reward_mode {self.reward_mode!r}: unknown; choose one of {', '.join(known)}")
-        if self.control_mode not in CONTROL_MODES:
-            raise InvalidInputError(
-                f"control_mode {self.control_mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}"
-            )
+        check_reward_mode(self.reward_mode)
+        check_control_mode(self.control_mode)
 
     def sampler(self) -> StartSampler:
         """Draws episode starts. Raises what :class:`StartSampler` raises."""

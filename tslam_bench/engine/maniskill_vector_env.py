@@ -15,18 +15,21 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tslam_bench.constants import HORIZON
-from tslam_bench.engine.worker_vector_env import check_action_repeat
+from tslam_bench.engine.requests import check_action_repeat, check_mask, check_seeds
+from tslam_bench.engine.same_step import info_at_the_end, with_masks
+from tslam_bench.engine.worker_vector_env import INFO
 from tslam_bench.errors import InvalidInputError
 
-_COUNTS = ("new_touched", "new_visited")
+_SUMMED = ("new_touched", "new_visited")
 
 
 class BatchedVectorEnv(VectorEnv):
     """A ``TactileSLAM`` task with ``num_envs`` sub-scenes as a vector environment with autoreset ``SAME_STEP``.
 
     Observations, rewards, flags and ``info`` are torch tensors on the simulation's device, else as in
-    :class:`tslam_bench.engine.worker_vector_env.TactileVectorEnv`. Episodes end at the horizon alone, so the steps are counted on
-    the host and no step waits for the device.
+    :class:`tslam_bench.engine.worker_vector_env.TactileVectorEnv`. ``info["final_obs"]`` is a numpy array of objects there
+    too, with tensors in its observations. Gymnasium's vector wrappers compute with numpy, so they do not take this environment.
+    Episodes end at the horizon alone, so the steps are counted on the host and no step waits for the device.
 
     On a GPU an object belongs to its sub-scene until ``reset(options={"reconfigure": True})`` draws anew; poses and starts
     change with every episode.
@@ -61,25 +64,18 @@ class BatchedVectorEnv(VectorEnv):
             options: ``object`` and ``pose``, one value or one per environment; ``reset_mask``, (num_envs,) bool, which
                 environments to reset (unseeded); ``reconfigure``, whether a GPU scene is rebuilt with other objects.
         """
+        seeds = check_seeds(seed, self.num_envs)
+        if any(value is None for value in seeds) and not all(value is None for value in seeds):
+            raise InvalidInputError("seed: None among numbers; ManiSkill seeds every environment or none")
         given = dict(options or {})
-        mask = given.pop("reset_mask", None)
-        if seed is not None:
-            numbers = range(int(seed), int(seed) + self.num_envs) if isinstance(seed, (int, np.integer)) else seed
-            seed = None if all(number is None for number in numbers) else [int(number or 0) for number in numbers]
-        if mask is not None:
-            mask = np.asarray(mask)
-            if mask.shape != (self.num_envs,) or mask.dtype != bool:
-                raise InvalidInputError(
-                    f"options['reset_mask']: shape {mask.shape} {mask.dtype}; give ({self.num_envs},) bool"
-                )
-            if seed is not None:
+        mask = check_mask(given, self.num_envs)
+        if given.pop("reset_mask", None) is not None:
+            if seeds[0] is not None:
                 raise InvalidInputError("options['reset_mask']: a partial reset takes no seed; leave one of them out")
             given["env_idx"] = torch.as_tensor(np.flatnonzero(mask), device=self.device)
-            self._steps[mask] = 0
-        else:
-            self._steps[:] = 0
-        observation, info = self.environment.reset(seed=seed, options=given)
-        return observation, _without_reconfigure(info)
+        observation, info = self.environment.reset(seed=None if seeds[0] is None else seeds, options=given)
+        self._steps[mask] = 0
+        return observation, with_masks(_counts(info), torch.tensor(mask, device=self.device))
 
     def step(self, actions: Any) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
         """One control step of every environment, or ``action_repeat`` of them.
@@ -87,42 +83,32 @@ class BatchedVectorEnv(VectorEnv):
         Raises:
             InvalidInputError: actions of the wrong shape.
         """
-        observation, total, terminated, truncated, info = self._control_step(actions)
+        observation, total, terminated, truncated, info = self.environment.step(actions)
+        counts = _counts(info)
         for _ in range(self.action_repeat - 1):
-            before, total = {name: info[name].clone() for name in _COUNTS}, total.clone()
-            observation, reward, terminated, truncated, info = self._control_step(actions)
+            total, before = total.clone(), {name: counts[name].clone() for name in _SUMMED}
+            observation, reward, terminated, truncated, info = self.environment.step(actions)
             total = total + reward
+            counts = _counts(info)
             for name, value in before.items():
-                info[name] = info[name] + value
-                if "final_info" in info:
-                    info["final_info"][name] = info["final_info"][name] + value
-        return observation, total, terminated, truncated, info
-
-    def _control_step(
-        self, actions: Any
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
-        observation, reward, terminated, truncated, info = self.environment.step(actions)
-        info = _without_reconfigure(info)
-        self._steps += 1
+                counts[name] = counts[name] + value
+        self._steps += self.action_repeat
         ended = self._steps >= HORIZON
-        if ended.any():
-            final_obs = {key: value.clone() for key, value in observation.items()}
-            final_info = {key: value.clone() for key, value in info.items()}
-            options: dict[str, Any] = {}
-            if not ended.all():
-                options["env_idx"] = torch.as_tensor(np.flatnonzero(ended), device=self.device)
-            reward, truncated = reward.clone(), truncated.clone()
-            observation, after = self.environment.reset(options=options)
-            self._steps[ended] = 0
-            flags = torch.as_tensor(ended, device=self.device)
-            info["elapsed_steps"] = after["elapsed_steps"]  # the counts stay those of the step
-            info.update(final_obs=final_obs, _final_obs=flags, final_info=final_info, _final_info=flags.clone())
-        return observation, reward, terminated, truncated, info
+        if not ended.any():
+            return observation, total, terminated, truncated, with_masks(counts, torch.ones_like(truncated))
+        envs = torch.as_tensor(np.flatnonzero(ended), device=self.device)
+        flags = torch.as_tensor(ended, device=self.device)
+        last = {name: value[envs] for name, value in observation.items()}
+        info = info_at_the_end(counts, flags, np.flatnonzero(ended).tolist(), last)
+        total, terminated, truncated = total.clone(), terminated.clone(), truncated.clone()  # a reset writes there
+        observation, _ = self.environment.reset(options={} if ended.all() else {"env_idx": envs})
+        self._steps[ended] = 0
+        return observation, total, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the task."""
         self.environment.close()
 
 
-def _without_reconfigure(info: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in info.items() if key != "reconfigure"}
+def _counts(info: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: info[name] for name in INFO}

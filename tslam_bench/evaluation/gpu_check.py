@@ -17,6 +17,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.evaluation.observations import last_observation
 
 PERTURBATION: Final = 1e-4
 """Largest change of an action (of 1) in the yardstick's episodes."""
@@ -93,7 +94,7 @@ def record(envs: VectorEnv, episodes: Episodes) -> Recording:
     start = time.perf_counter()
     for action in episodes.actions:
         observation, reward, _, _, info = envs.step(action)
-        last = info.get("final_obs", observation)
+        last = last_observation(observation, info)
         touch.append(_host(last["touch"]).astype(bool))
         qpos.append(_host(last["qpos"]))
         rewards.append(_host(reward).astype(np.float32))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.episodes import Episode, episode_seed, policy_seed
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.observations import observation_to_numpy, to_numpy
+from tslam_bench.evaluation.observations import last_observation, observation_to_numpy, to_numpy
 from tslam_bench.evaluation.policy import Baseline
 from tslam_bench.files import atomic_file
 from tslam_bench.grids import check_pose, pack, unpack
@@ -162,8 +162,7 @@ def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[Episo
         ended = to_numpy(terminated) | to_numpy(truncated)
         if ended.any() != (step == HORIZON - 1) or ended.any() != ended.all():
             raise InvalidInputError(f"environment: an episode ended after {step + 1} steps, expected {HORIZON}")
-        seen = info["final_obs"] if ended.any() else raw
-        occupancy = to_numpy(seen["occupancy"]).astype(bool)
+        occupancy = to_numpy(last_observation(raw, info)["occupancy"]).astype(bool)
         touched_step[occupancy[:, 0] & (touched_step < 0)] = step
         for env, value in enumerate(to_numpy(reward).tolist()):
             episode_return[env] += value

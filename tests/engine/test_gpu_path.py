@@ -25,7 +25,9 @@ from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
 from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
 from tslam_bench.engine.native_output import captured_output
 from tslam_bench.engine.rewards import Rewards
-from tslam_bench.engine.sensing import TactileSensing
+from tslam_bench.engine.sensing import Sensing
+from tslam_bench.engine.sensing_numba import CompiledSensing
+from tslam_bench.engine.sensing_torch import TorchSensing
 from tslam_bench.engine.skin import build_skin
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.gpu_check import Episodes, compare, judge, record
@@ -53,9 +55,11 @@ def simulated():
     return np.stack(links), np.stack(qpos), EPISODES.actions[:STEPS]
 
 
-def begun(backend, mode: str) -> tuple[TactileSensing, Rewards]:
-    sensing = TactileSensing(ENVS, build_skin(load_hand().shapes), backend)
-    rewards = Rewards(mode, ENVS, backend)
+def begun(mode: str, device: str | None) -> tuple[Sensing, Rewards]:
+    """Sensing and rewards at the start of the episodes: as the CPU engine has them, or on a torch device."""
+    skin = build_skin(load_hand().shapes)
+    sensing: Sensing = CompiledSensing(ENVS, skin) if device is None else TorchSensing(ENVS, skin, device)
+    rewards = Rewards(mode, ENVS, sensing.backend)
     for env, (name, pose) in enumerate(zip(EPISODES.objects, EPISODES.poses, strict=True)):
         prepared = load_object(name)
         sensing.set_object(env, name, prepared.field, pose)
@@ -65,20 +69,11 @@ def begun(backend, mode: str) -> tuple[TactileSensing, Rewards]:
     return sensing, rewards
 
 
-class Dense(TorchBackend):
-    """The device's way of selecting probes (all of them), on any device."""
-
-    def select(self, mask):
-        count, width = mask.shape
-        flat = torch.arange(count * width, device=self.device)
-        return flat // width, flat % width
-
-
 @pytest.mark.parametrize("mode", REWARD_MODES)
-def test_torch_on_real_episodes_is_numpy_in_every_reward_mode(simulated, mode):
+def test_tensors_on_real_episodes_are_the_cpu_engine_in_every_reward_mode(simulated, mode):
     links, _, _ = simulated
-    host, host_rewards = begun(NumpyBackend(), mode)  # test_sensing compares the compiled sensing with it
-    device, device_rewards = begun(Dense("cpu"), mode)
+    host, host_rewards = begun(mode, None)
+    device, device_rewards = begun(mode, "cpu")
     felt = 0
     for step in range(STEPS):
         a = host.step(links[step], np.full(ENVS, step))
@@ -119,9 +114,8 @@ class NoHostCopies(TorchDispatchMode):
 @pytest.mark.parametrize("mode", REWARD_MODES)
 def test_a_step_makes_no_host_copies(mode):
     """On torch's meta device nothing has a value: whatever asks for one fails. ``disagreement`` has to: qhull is on the host."""
-    backend = Dense("meta")
-    sensing, rewards = begun(backend, mode)
-    targets = DriveTargets(CONTROL_MODES[0], backend)
+    sensing, rewards = begun(mode, "meta")
+    targets = DriveTargets(CONTROL_MODES[0], sensing.backend)
     links = torch.zeros((ENVS, len(SKIN_LINKS), 3, 4), device="meta")
     steps = torch.zeros(ENVS, dtype=torch.int32, device="meta")
     action, qpos = (torch.zeros((ENVS, NUM_JOINTS), device="meta") for _ in range(2))

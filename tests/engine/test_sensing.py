@@ -1,4 +1,4 @@
-"""Touch and coverage against closed forms and brute force; torch against numpy; one environment against many."""
+"""Touch and coverage against closed forms and brute force; compiled loops against tensors; one environment against many."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from tslam_bench import grids
 from tslam_bench.constants import TOUCH_DISTANCE
-from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
-from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, FieldAtlas, TactileSensing
+from tslam_bench.engine.field_atlas import FieldAtlas
+from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, Contacts, Sensing
 from tslam_bench.engine.sensing_numba import CompiledSensing
+from tslam_bench.engine.sensing_torch import TorchSensing
 from tslam_bench.engine.skin import Skin, build_skin
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.objects.hand import load_hand
@@ -47,12 +48,35 @@ def random_links(generator: np.random.Generator, num_envs: int) -> np.ndarray:
     return matrices
 
 
-def arrays(num_envs: int, skin: Skin) -> TactileSensing:
-    return TactileSensing(num_envs, skin, NumpyBackend())
+class OnTensors:
+    """:class:`TorchSensing` on CPU tensors, behind the numpy interface of :class:`CompiledSensing`."""
+
+    def __init__(self, num_envs: int, skin: Skin) -> None:
+        self.sensing = TorchSensing(num_envs, skin, "cpu")
+        self.set_object, self.begin = self.sensing.set_object, self.sensing.begin
+
+    def step(self, link_matrices: np.ndarray, step: np.ndarray) -> Contacts:
+        contacts = self.sensing.step(torch.from_numpy(link_matrices), torch.from_numpy(step))
+        return Contacts(**{name: getattr(contacts, name).numpy() for name in CONTACTS})
+
+    def link_touch(self) -> np.ndarray:
+        return self.sensing.link_touch().numpy()
+
+    @property
+    def touched(self) -> np.ndarray:
+        return self.sensing.touched.numpy()
+
+    @property
+    def visited(self) -> np.ndarray:
+        return self.sensing.visited.numpy()
+
+    @property
+    def touched_step(self) -> np.ndarray:
+        return self.sensing.touched_step.numpy()
 
 
-def make(backend, skin, poses, fields):
-    return put(TactileSensing(len(poses), skin, backend), poses, fields)
+KINDS = [OnTensors, CompiledSensing]
+CONTACTS = ("on", "new", "points", "mask", "new_touched", "new_visited")
 
 
 def put(sensing, poses, fields):
@@ -62,7 +86,7 @@ def put(sensing, poses, fields):
     return sensing
 
 
-@pytest.mark.parametrize("kind", [arrays, CompiledSensing])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("pose", range(8))
 def test_touch_and_contact_points_on_a_sphere(skin, pose, kind):
     sensing = put(kind(1, skin), [pose], [("sphere", sphere_field())])
@@ -92,7 +116,7 @@ def test_touch_and_contact_points_on_a_sphere(skin, pose, kind):
     np.testing.assert_array_equal(sensing.link_touch()[0], links)
 
 
-@pytest.mark.parametrize("kind", [arrays, CompiledSensing])
+@pytest.mark.parametrize("kind", KINDS)
 def test_grids_accumulate_like_python_sets(skin, kind):
     num_envs, generator = 3, np.random.default_rng(5)
     sensing = put(kind(num_envs, skin), [0, 3, 6], [("sphere", sphere_field())] * num_envs)
@@ -121,89 +145,78 @@ def test_grids_accumulate_like_python_sets(skin, kind):
     assert sensing.touched[0].sum() == touched_before[0], "the others keep their grids"
 
 
-def assert_same(a, b) -> None:
+def assert_same(a: Contacts, b: Contacts, envs: slice = slice(None), exact: bool = False) -> None:
     """Equal touch, counts and masks; contact points to a float32's last bit, where the libraries may round differently."""
-    for name in ("on", "new", "mask", "new_touched", "new_visited"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name).numpy(), err_msg=name)
-    np.testing.assert_allclose(a.points, b.points.numpy(), atol=3e-8)
+    for name in CONTACTS:
+        first, second = getattr(a, name)[envs], getattr(b, name)
+        if name == "points" and not exact:
+            np.testing.assert_allclose(first, second, atol=3e-8)
+        else:
+            np.testing.assert_array_equal(first, second, err_msg=name)
 
 
-def test_torch_agrees_with_numpy_and_any_batch_gives_the_same_bits(skin):
-    num_envs, generator = 5, np.random.default_rng(7)
-    poses = [0, 2, 5, 7, 1]
-    fields = [("large", sphere_field(0.06, 2e-3)), ("small", sphere_field(0.03, 1.5e-3))]
-    chosen = [fields[env % 2] for env in range(num_envs)]
-    batch = make(NumpyBackend(), skin, poses, chosen)
-    tensors = make(TorchBackend("cpu"), skin, poses, chosen)
-    single = [make(NumpyBackend(), skin, [poses[env]], [chosen[env]]) for env in range(num_envs)]
-    for step in range(1, 5):
-        matrices = random_links(generator, num_envs)
-        a = batch.step(matrices, np.full(num_envs, step))
-        b = tensors.step(torch.from_numpy(matrices), torch.full((num_envs,), step))
-        assert a.on.any(axis=1).all()
-        assert_same(a, b)
-        for env in range(num_envs):
-            c = single[env].step(matrices[env : env + 1], np.array([step]))
-            for name in ("on", "new", "points", "mask", "new_touched", "new_visited"):
-                np.testing.assert_array_equal(getattr(a, name)[env], getattr(c, name)[0], err_msg=name)
-        for name in ("touched", "visited", "touched_step", "on"):
-            np.testing.assert_array_equal(getattr(batch, name), getattr(tensors, name).numpy(), err_msg=name)
-        np.testing.assert_array_equal(batch.link_touch(), tensors.link_touch().numpy())
-
-
-def test_compiled_loops_give_the_bits_of_the_array_code(skin):
-    """Random links and fields, several episodes: every output and every grid, bit for bit."""
+def test_compiled_loops_agree_with_tensors(skin):
+    """Random links and fields, several episodes: every output and every grid; a saved state goes on as the original."""
     num_envs, generator = 6, np.random.default_rng(9)
     poses = [0, 2, 5, 7, 1, 4]
     fields = [("large", sphere_field(0.06, 2e-3)), ("small", sphere_field(0.03, 1.5e-3))]
     chosen = [fields[env % 2] for env in range(num_envs)]
     occupancy = np.zeros((num_envs, 2, 32, 32, 32), dtype=np.uint8)
-    plain = put(arrays(num_envs, skin), poses, chosen)
+    tensors = put(OnTensors(num_envs, skin), poses, chosen)
     compiled = put(CompiledSensing(num_envs, skin, occupancy), poses, chosen)
+    restored: list[Sensing] = []
     felt = 0
     for step in range(12):
         if step == 7:
-            for sensing in (plain, compiled):
+            for sensing in (tensors, compiled):
                 sensing.begin([1, 4])
-        matrices = random_links(generator, num_envs)
-        np.testing.assert_array_equal(plain.touches(matrices), compiled.touches(matrices))
-        a, b = (sensing.step(matrices, np.full(num_envs, step)) for sensing in (plain, compiled))
-        felt += int(a.on.sum())
-        for name in ("on", "new", "points", "mask", "new_touched", "new_visited"):
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
-        for name in ("touched", "visited", "touched_step", "on"):
-            np.testing.assert_array_equal(getattr(plain, name), getattr(compiled, name), err_msg=name)
-        np.testing.assert_array_equal(plain.link_touch(), compiled.link_touch())
-    assert felt > 1000
-    np.testing.assert_array_equal(occupancy[:, 0].view(bool), compiled.touched)
-    np.testing.assert_array_equal(occupancy[:, 1].view(bool), compiled.visited)
-
-
-def test_the_device_path_covers_every_probe_and_agrees(skin):
-    """What a GPU computes (all probes, no compaction), run on the CPU."""
-    generator = np.random.default_rng(11)
-
-    class Dense(TorchBackend):
-        def select(self, mask):
-            count, width = mask.shape
-            flat = torch.arange(count * width)
-            return flat // width, flat % width
-
-    poses, chosen = [4, 1], [("sphere", sphere_field())] * 2
-    compact = make(NumpyBackend(), skin, poses, chosen)
-    dense = make(Dense("cpu"), skin, poses, chosen)
-    for step in range(1, 4):
-        matrices = random_links(generator, 2)
-        a = compact.step(matrices, np.full(2, step))
-        b = dense.step(torch.from_numpy(matrices), torch.full((2,), step))
+        if step == 9:
+            restored = [put(TorchSensing(num_envs, skin, "cpu"), poses, chosen)]
+            restored.append(put(CompiledSensing(num_envs, skin), poses, chosen))
+            for sensing, saved in zip(restored, (compiled.state(), tensors.sensing.state()), strict=True):
+                sensing.set_state(range(num_envs), saved)
+        matrices, now = random_links(generator, num_envs), np.full(num_envs, step)
+        before = compiled.touched.copy()
+        on = compiled.touches(matrices)
+        np.testing.assert_array_equal(compiled.touched, before, err_msg="looking changes nothing")
+        a, b = (sensing.step(matrices, now) for sensing in (compiled, tensors))
         assert_same(a, b)
-    np.testing.assert_array_equal(compact.touched, dense.touched.numpy())
+        np.testing.assert_array_equal(on, a.on)
+        felt += int(a.on.sum())
+        for name in ("touched", "visited", "touched_step"):
+            np.testing.assert_array_equal(getattr(tensors, name), getattr(compiled, name), err_msg=name)
+        np.testing.assert_array_equal(tensors.link_touch(), compiled.link_touch())
+        np.testing.assert_array_equal(tensors.sensing.occupancy, occupancy)
+        for sensing in restored:
+            on_tensors = isinstance(sensing, TorchSensing)
+            c = sensing.step(*(map(torch.from_numpy, (matrices, now)) if on_tensors else (matrices, now)))
+            for name in ("new", "new_touched", "new_visited"):
+                np.testing.assert_array_equal(getattr(c, name), getattr(a, name), err_msg=f"restored {name}")
+            np.testing.assert_array_equal(sensing.touched_step, compiled.touched_step)
+    assert felt > 1000 and len(restored) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_batch_gives_the_same_bits(skin, kind):
+    num_envs, generator = 5, np.random.default_rng(7)
+    poses = [0, 2, 5, 7, 1]
+    fields = [("large", sphere_field(0.06, 2e-3)), ("small", sphere_field(0.03, 1.5e-3))]
+    chosen = [fields[env % 2] for env in range(num_envs)]
+    batch = put(kind(num_envs, skin), poses, chosen)
+    single = [put(kind(1, skin), [poses[env]], [chosen[env]]) for env in range(num_envs)]
+    for step in range(1, 5):
+        matrices = random_links(generator, num_envs)
+        together = batch.step(matrices, np.full(num_envs, step))
+        assert together.on.any(axis=1).all()
+        for env in range(num_envs):
+            one = slice(env, env + 1)
+            assert_same(together, single[env].step(matrices[one], np.array([step])), one, exact=True)
 
 
 def test_fields_come_and_go_without_growing(skin):
     """Many objects through few environments: always the field of the object at hand, in bounded memory."""
     generator = np.random.default_rng(13)
-    sensing = TactileSensing(2, skin, NumpyBackend())
+    sensing = CompiledSensing(2, skin)
     for episode in range(60):
         radii = 0.03 + 0.001 * np.array([episode % 23, (7 * episode) % 19])
         for env, radius in enumerate(radii):
@@ -212,6 +225,6 @@ def test_fields_come_and_go_without_growing(skin):
         matrices = random_links(generator, 2)
         on = sensing.touches(matrices)
         for env, radius in enumerate(radii):
-            alone = make(NumpyBackend(), skin, [0], [("alone", sphere_field(radius, 3e-3))])
+            alone = put(CompiledSensing(1, skin), [0], [("alone", sphere_field(radius, 3e-3))])
             np.testing.assert_array_equal(on[env], alone.touches(matrices[env : env + 1])[0])
-    assert len(sensing.atlas.values) <= (2 + FieldAtlas.SPARE_SLOTS) * sphere_field(0.053, 3e-3).values.size
+    assert len(sensing.atlas.bound().values) <= (2 + FieldAtlas.SPARE_SLOTS) * sphere_field(0.053, 3e-3).values.size

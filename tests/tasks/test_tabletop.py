@@ -30,13 +30,13 @@ def skin_points():
 
 def placed(env: gym.Env, points) -> np.ndarray:
     """(P, 3) where the hand's points are in the world (m)."""
-    matrices = env.unwrapped.agent.host_skin_matrices()[0, points.link]
+    matrices = env.unwrapped.hand.skin_matrices()[0, points.link]
     return np.einsum("pij,pj->pi", matrices[:, :, :3], points.position) + matrices[:, :, 3]
 
 
 def table_and_object(env: gym.Env):
     entities = {entity.name: entity for entity in env.unwrapped.scene.sub_scenes[0].entities}
-    return entities.get("scene-0_table"), entities["scene-0_object"]
+    return entities.get("table"), entities["object"]
 
 
 def pressing(seed: int, steps: int) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_the_table_stops_the_hand_and_is_not_felt(environment, skin_points):
             found.append(float((half - np.abs(placed(env, skin_points) - centre)).min(axis=1).max()))
         for contact in environment.unwrapped.scene.px.get_contacts():
             names = {body.entity.name for body in contact.bodies}
-            met += "scene-0_table" in names and any(point.separation < 0.5e-3 for point in contact.points)
+            met += "table" in names and any(point.separation < 0.5e-3 for point in contact.points)
     assert met > 100 and max(depths) < 4e-3, "the hand rests on the table"
     assert max(free_depths) > 0.02, "without a table it would have gone into it"
     touched = environment.unwrapped.touched[0]

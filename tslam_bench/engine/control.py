@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tslam_bench.engine.arrays import Backend
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.engine.arrays import Array, Backend
+from tslam_bench.engine.requests import check_control_mode
 from tslam_bench.hand_constants import (
-    CONTROL_MODES,
     COUPLED_JOINTS,
     COUPLING_END,
     COUPLING_MIDDLE,
@@ -19,8 +16,6 @@ from tslam_bench.hand_constants import (
     JOINT_LIMITS,
     JOINT_NAMES,
 )
-
-Array = Any
 
 MIDDLE = np.array([JOINT_NAMES.index(middle) for middle, _ in COUPLED_JOINTS])
 END = np.array([JOINT_NAMES.index(end) for _, end in COUPLED_JOINTS])
@@ -39,9 +34,7 @@ class DriveTargets:
     """
 
     def __init__(self, mode: str, backend: Backend, step_limit: NDArray[np.float64] = DELTA_STEP) -> None:
-        if mode not in CONTROL_MODES:
-            raise InvalidInputError(f"control_mode {mode!r}: unknown; choose one of {', '.join(CONTROL_MODES)}")
-        self.mode = mode
+        self.mode = check_control_mode(mode)
         self._backend = backend
         limits = JOINT_LIMITS.astype(np.float32)
         self._low, self._high = backend.array(limits[:, 0]), backend.array(limits[:, 1])
@@ -74,7 +67,7 @@ def _couple(target: Array, backend: Backend, middles: Array, ends: Array) -> Arr
     stretch = COUPLING_END * end - COUPLING_MIDDLE * middle
     excess = stretch - backend.clip(stretch, -COUPLING_SLACK, COUPLING_SLACK)
     scale = 1.0 / (COUPLING_END**2 + COUPLING_MIDDLE**2)
-    coupled = target.copy() if backend.is_numpy else target.clone()
+    coupled = backend.array(target)
     coupled[:, middles] = middle + (COUPLING_MIDDLE * scale) * excess
     coupled[:, ends] = end - (COUPLING_END * scale) * excess
     return coupled
@@ -84,7 +77,7 @@ def _pull_back(target: Array, backend: Backend, middles: Array, ends: Array) -> 
     """Straightens the joint that is ahead of its tendon: mends what clipping did to the coupling, inside the limits."""
     xp = backend.module
     middle, end = target[:, middles], target[:, ends]
-    pulled = target.copy() if backend.is_numpy else target.clone()
+    pulled = backend.array(target)
     pulled[:, ends] = xp.minimum(end, (COUPLING_SLACK + COUPLING_MIDDLE * middle) * (1.0 / COUPLING_END))
     pulled[:, middles] = xp.minimum(middle, (COUPLING_SLACK + COUPLING_END * end) * (1.0 / COUPLING_MIDDLE))
     return pulled

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS
 from tslam_bench.engine.arrays import NumpyBackend
 from tslam_bench.engine.control import DriveTargets
-from tslam_bench.engine.hand_scene import BodyPool, HandScene
+from tslam_bench.engine.hand_scene import physx_scenes
 from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices
 from tslam_bench.engine.physics import PROTOCOL, PhysicsSettings
 from tslam_bench.engine.requests import check_control_mode, check_reward_mode
@@ -58,6 +59,8 @@ class BatchSettings:
     control_mode: str = CONTROL_MODES[0]
     environment_id: str = ENVIRONMENT_ID
     physics: PhysicsSettings = PROTOCOL
+    scenes: Callable[[Path, PhysicsSettings, bool, int], Sequence[Any]] = physx_scenes
+    """Makes the scenes; benchmarks put another simulator's here. Worker processes have to be able to import it."""
 
     def __post_init__(self) -> None:
         check_reward_mode(self.reward_mode)
@@ -79,12 +82,11 @@ class HandBatch:
 
     def __init__(self, num_envs: int, settings: BatchSettings, arrays: Mapping[str, NDArray]) -> None:
         hand, backend = load_hand(), NumpyBackend()
-        bodies = BodyPool(settings.physics)
         self.num_envs = num_envs
         self._arrays = arrays
         self._starts = settings.sampler()
         table = self._starts.variant.table
-        self._scenes = [HandScene(hand.urdf, bodies, table) for _ in range(num_envs)]
+        self._scenes = settings.scenes(hand.urdf, settings.physics, table, num_envs)
         self._sensing = CompiledSensing(num_envs, build_skin(hand.shapes), arrays["occupancy"])
         self._targets = DriveTargets(settings.control_mode, backend, settings.physics.step_limit)
         self._rewards = Rewards(settings.reward_mode, num_envs, backend) if settings.reward_mode != "none" else None
@@ -132,15 +134,7 @@ class HandBatch:
         if felt.any():
             name = self.object_name[envs[int(np.flatnonzero(felt)[0])]]
             raise AssetError(f"{name}: touches the hand at the start, so it does not fit in the workspace")
-        for name in (
-            "reward",
-            "truncated",
-            "new_touched",
-            "new_visited",
-            "elapsed_steps",
-            "touch",
-            "time",
-        ):
+        for name in (*STEP_ARRAYS, "touch", "time"):
             self._arrays[name][list(envs)] = 0
 
     def step(self, repeat: int = 1) -> None:

@@ -15,7 +15,7 @@ from tslam_bench import grids
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS, TABLE_SIZE
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.geometry.triangles import face_normals
-from tslam_bench.hand_constants import DELTA_STEP, FORCE_LIMIT
+from tslam_bench.hand_constants import ARMATURE, DAMPING, DELTA_STEP, FORCE_LIMIT, STIFFNESS
 from tslam_bench.objects.store import PreparedObject
 
 SOLVER_POSITION_ITERATIONS: Final = 8
@@ -31,6 +31,7 @@ BOUNCE_THRESHOLD: Final = 2.0
 STATIC_FRICTION: Final = 1.0
 DYNAMIC_FRICTION: Final = 1.0
 RESTITUTION: Final = 0.0
+MATERIAL: Final = (STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
 COOKING_SCALE: Final = 100.0
 """Hulls are cooked in centimetres and scaled back: PhysX's plane tolerance is 0.7 mm and eats small hulls cooked in metres."""
 
@@ -93,25 +94,55 @@ PROTOCOL: Final = PhysicsSettings()
 """The protocol's settings."""
 
 
+def scene_settings(settings: PhysicsSettings = PROTOCOL) -> dict[str, Any]:
+    """The settings of scenes, bodies and shapes, by the names of ManiSkill's ``SceneConfig``."""
+    return {
+        "gravity": np.array(GRAVITY),
+        "bounce_threshold": BOUNCE_THRESHOLD,
+        "sleep_threshold": SLEEP_THRESHOLD,
+        "contact_offset": settings.contact_offset,
+        "rest_offset": REST_OFFSET,
+        "solver_position_iterations": settings.position_iterations,
+        "solver_velocity_iterations": SOLVER_VELOCITY_ITERATIONS,
+        "enable_pcm": settings.persistent_contacts,
+        "enable_tgs": True,
+        "enable_ccd": False,
+        "enable_enhanced_determinism": False,
+        "enable_friction_every_iteration": True,
+        "cpu_workers": 0,
+    }
+
+
 def configure(settings: PhysicsSettings = PROTOCOL) -> None:
-    """Sets SAPIEN's global defaults for scenes, bodies and shapes that are made next: what ManiSkill sets for the task."""
-    physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=REST_OFFSET)
-    physx.set_body_config(
-        solver_position_iterations=settings.position_iterations,
-        solver_velocity_iterations=SOLVER_VELOCITY_ITERATIONS,
-        sleep_threshold=SLEEP_THRESHOLD,
-    )
-    physx.set_scene_config(
-        gravity=np.array(GRAVITY),
-        bounce_threshold=BOUNCE_THRESHOLD,
-        enable_pcm=settings.persistent_contacts,
-        enable_tgs=True,
-        enable_ccd=False,
-        enable_enhanced_determinism=False,
-        enable_friction_every_iteration=True,
-        cpu_workers=0,
-    )
-    physx.set_default_material(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
+    """Sets SAPIEN's global defaults for the scenes, bodies and shapes that are made next."""
+    values = scene_settings(settings)
+    shape = ("contact_offset", "rest_offset")
+    body = ("solver_position_iterations", "solver_velocity_iterations", "sleep_threshold")
+    physx.set_shape_config(**{name: values.pop(name) for name in shape})
+    physx.set_body_config(**{name: values.pop(name) for name in body})
+    physx.set_scene_config(**values)
+    physx.set_default_material(*MATERIAL)
+
+
+class Drives:
+    """The position drives of one hand: sets gains, force limits and armature; joint friction is zero.
+
+    Args:
+        joints: SAPIEN's 28 joints in the order of ``JOINT_NAMES``.
+        settings: of the physics.
+    """
+
+    def __init__(self, joints: Sequence[Any], settings: PhysicsSettings = PROTOCOL) -> None:
+        for index, (joint, force) in enumerate(zip(joints, settings.force_limit, strict=True)):
+            joint.set_drive_properties(float(STIFFNESS[index]), float(DAMPING[index]), float(force), "force")
+            joint.set_friction(0.0)
+            joint.set_armature(np.array([ARMATURE[index]], dtype=np.float32))
+        self._setters = [joint.set_drive_target for joint in joints]
+
+    def set_targets(self, targets: Sequence[float]) -> None:
+        """Sets the 28 targets (m, rad), plain numbers; CPU simulation."""
+        for setter, target in zip(self._setters, targets, strict=True):
+            setter(target)
 
 
 def pose_quaternion(pose: int) -> np.ndarray:
@@ -130,7 +161,7 @@ def collision_shapes(prepared: PreparedObject) -> list[physx.PhysxCollisionShape
     Raises:
         AssetError: PhysX cannot cook a hull.
     """
-    material = physx.PhysxMaterial(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
+    material = physx.PhysxMaterial(*MATERIAL)
     shapes = []
     for index, (vertices, _) in enumerate(prepared.hulls):
         try:
@@ -148,15 +179,17 @@ def collision_shapes(prepared: PreparedObject) -> list[physx.PhysxCollisionShape
     return shapes
 
 
-def object_entity(prepared: PreparedObject, name: str, shapes: Sequence[Any], can_render: bool) -> sapien.Entity:
-    """A fixed body with the object's hulls, and its true mesh as its looks where rendering is possible."""
+def object_entity(prepared: PreparedObject, name: str = "object", can_render: bool = False) -> sapien.Entity:
+    """A fixed body with the object's hulls, and its true mesh as its looks where rendering is possible.
+
+    Raises:
+        AssetError: PhysX cannot cook a hull.
+    """
     entity = sapien.Entity()
     entity.name = name
     body = physx.PhysxRigidDynamicComponent()
-    body.kinematic = (
-        True  # fixed in the world; kinematic rather than static so that a GPU scene can turn it between episodes
-    )
-    for shape in shapes:
+    body.kinematic = True  # fixed, but not static: a GPU scene turns it between episodes
+    for shape in collision_shapes(prepared):
         body.attach(shape)
     if len(body.collision_shapes) != len(prepared.hulls):
         raise AssetError(f"{prepared.name}: {len(body.collision_shapes)} of {len(prepared.hulls)} hulls reached PhysX")
@@ -166,14 +199,14 @@ def object_entity(prepared: PreparedObject, name: str, shapes: Sequence[Any], ca
     return entity
 
 
-def table_entity(name: str, can_render: bool) -> sapien.Entity:
+def table_entity(name: str = "table", can_render: bool = False) -> sapien.Entity:
     """The tabletop variant's table: a fixed box."""
     entity = sapien.Entity()
     entity.name = name
     body = physx.PhysxRigidDynamicComponent()
     body.kinematic = True  # as the object: its height changes with the object between episodes
     half = np.array(TABLE_SIZE, dtype=np.float32) / 2
-    material = physx.PhysxMaterial(STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
+    material = physx.PhysxMaterial(*MATERIAL)
     body.attach(physx.PhysxCollisionShapeBox(half, material))
     if can_render:
         looks = sapien.render.RenderBodyComponent()
@@ -187,6 +220,40 @@ def table_entity(name: str, can_render: bool) -> sapien.Entity:
 def table_pose(prepared: PreparedObject) -> sapien.Pose:
     """Where the table stands: centred below the object, its top at the lowest point of the upright object (poses 0..3)."""
     return sapien.Pose([0.0, 0.0, float(prepared.vertices[:, 2].min()) - TABLE_SIZE[2] / 2])
+
+
+class BodyPool:
+    """Cooked objects of one process, lent to its scenes: cooking is expensive, moving a body between systems is cheap.
+
+    Args:
+        settings: the physics that the bodies are made for.
+        can_render: whether the bodies have looks.
+    """
+
+    def __init__(self, settings: PhysicsSettings = PROTOCOL, can_render: bool = False) -> None:
+        self.settings = settings
+        self.can_render = can_render
+        self._free: dict[str, list[sapien.Entity]] = {}
+        self._count = 0
+
+    def borrow(self, prepared: PreparedObject) -> sapien.Entity:
+        """A body of the object that is in no scene."""
+        waiting = self._free.get(prepared.name)
+        if waiting:
+            return waiting.pop()
+        configure(self.settings)
+        self._count += 1
+        return object_entity(prepared, can_render=self.can_render)
+
+    def give_back(self, prepared: PreparedObject, body: sapien.Entity) -> None:
+        """Takes a body that has left its scene."""
+        self._free.setdefault(prepared.name, []).append(body)
+        while self._count > CACHED_BODIES and any(self._free.values()):
+            oldest = next(name for name, bodies in self._free.items() if bodies)
+            self._free[oldest].pop()
+            if not self._free[oldest]:
+                del self._free[oldest]
+            self._count -= 1
 
 
 def _looks(prepared: PreparedObject) -> Any:

@@ -112,7 +112,7 @@ def check_actions(actions: Any, num_envs: int) -> NDArray[np.float32]:
     """Returns (E, 28) float32 finite actions; a single environment may be given (28,)."""
     try:
         value = np.asarray(actions, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise InvalidInputError(f"actions: not an array of numbers ({error}); give floats ({NUM_JOINTS},)") from error
     value = value.reshape(check_action_shape(value.shape, num_envs))
     finite = np.isfinite(value)

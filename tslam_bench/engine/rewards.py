@@ -7,19 +7,18 @@ environment, so that a step's work is bounded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
 from tslam_bench import grids
 from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE
-from tslam_bench.engine.arrays import Backend
+from tslam_bench.engine.arrays import Array, Backend
 from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, Contacts
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.geometry.alpha_shape import alpha_shape_samples, chamfer_l2, thin_out
 from tslam_bench.objects.store import PreparedObject
-
-Array = Any
 
 COVERAGE_WEIGHT: Final = 0.005
 """Lambda of ``r = r_d + lambda r_c``: makes the two terms' episode sums equal within a factor 2
@@ -84,8 +83,30 @@ class Rewards:
         exploration = MODE_SCALE[self.mode] * _EXPLORATION[self.mode](self, contacts)
         return exploration if self.mode == "no_coverage" else exploration + coverage
 
+    def state(self) -> dict[str, Array]:
+        """What the mode remembers of the running episodes, (E, ...) arrays: copies. Empty where it remembers nothing."""
+        parts = (part for part in (self._memory, self._surface) if part is not None)
+        return {name: self.backend.array(getattr(part, f"_{name}")) for part in parts for name in part.REMEMBERED}
+
+    def set_state(self, envs: Sequence[int], state: Mapping[str, Array]) -> None:
+        """Puts rows of :meth:`state`, one per entry of ``envs``, back.
+
+        Raises:
+            InvalidInputError: a state of another reward mode.
+        """
+        parts = [part for part in (self._memory, self._surface) if part is not None]
+        if {name for part in parts for name in part.REMEMBERED} != set(state):
+            raise InvalidInputError(
+                f"state: of another reward mode than this environment's {self.mode!r}; make one with the same reward_mode"
+            )
+        for part in parts:
+            for name in part.REMEMBERED:
+                getattr(part, f"_{name}")[list(envs)] = self.backend.array(state[name])
+        if self._shapes is not None and self._memory is not None:
+            self._shapes.recall(envs, self._memory)
+
     def _float(self, value: Array) -> Array:
-        return value.astype(np.float32) if self.backend.is_numpy else value.to(self.backend.module.float32)
+        return self.backend.cast(value, np.float32)
 
     def _discovery(self, contacts: Contacts) -> Array:
         return self._float(contacts.new_touched)
@@ -105,7 +126,7 @@ class Rewards:
     def _disagreement(self, contacts: Contacts) -> Array:
         assert self._memory is not None and self._shapes is not None
         self._memory.add(contacts.points, contacts.mask)
-        return self._shapes.step(self._memory, contacts.mask, self.backend)
+        return self.backend.array(self._shapes.step(self._memory, self.backend.host(contacts.mask.any(1))))
 
     def _chamfer(self, contacts: Contacts) -> Array:
         assert self._surface is not None
@@ -123,7 +144,7 @@ _EXPLORATION: Final[dict[str, Callable[[Rewards, Contacts], Array]]] = {
 }
 
 
-def _squared_distances(backend: Backend, a: Array, b: Array) -> Array:
+def _squared_distances(a: Array, b: Array) -> Array:
     """(E, m, n) squared distances between (E, m, 3) and (E, n, 3), summed axis by axis so that bits do not depend on E."""
     total: Array = None
     for axis in range(3):
@@ -135,11 +156,13 @@ def _squared_distances(backend: Backend, a: Array, b: Array) -> Array:
 class ContactMemory:
     """The known contact points of each environment: a ring of the latest ``MAX_KNOWN_CONTACTS``."""
 
+    REMEMBERED = ("points", "count")
+
     def __init__(self, num_envs: int, backend: Backend) -> None:
         self._backend = backend
         # One more slot than the ring holds: points that are not there are written to it and thrown away.
         self._points = backend.full((num_envs, MAX_KNOWN_CONTACTS + 1, 3), UNKNOWN, np.float32)
-        self._count = backend.zeros(num_envs, np.int64)
+        self._count = backend.full((num_envs,), 0, np.int64)
         self._rows = backend.array(np.arange(num_envs)[:, None])
 
     def begin(self, envs: Sequence[int]) -> None:
@@ -150,13 +173,12 @@ class ContactMemory:
     def known(self, env: int) -> np.ndarray:
         """(n, 3) float32 known points of one environment, on the host."""
         count = min(int(self._count[env]), MAX_KNOWN_CONTACTS)
-        points = self._points[env, :count]
-        return points if self._backend.is_numpy else points.cpu().numpy()
+        return self._backend.host(self._points[env, :count])
 
     def add(self, points: Array, mask: Array) -> None:
         """Adds (E, m, 3) points where (E, m) ``mask`` is set."""
         backend, xp = self._backend, self._backend.module
-        rank = xp.cumsum(backend.integer(mask), 1) - 1 + self._count[:, None]
+        rank = xp.cumsum(backend.cast(mask, np.int64), 1) - 1 + self._count[:, None]
         slot = xp.where(mask, rank % MAX_KNOWN_CONTACTS, MAX_KNOWN_CONTACTS)
         self._points[self._rows, slot] = points
         self._points[:, MAX_KNOWN_CONTACTS] = UNKNOWN
@@ -168,8 +190,8 @@ class ContactMemory:
         filled = int(min(int(self._count.max()), MAX_KNOWN_CONTACTS)) if backend.is_numpy else MAX_KNOWN_CONTACTS
         used = int(mask.sum(1).max()) if backend.is_numpy else mask.shape[1]
         if filled == 0 or used == 0:
-            return backend.zeros(mask.shape[0], np.float32)
-        squared = _squared_distances(backend, points[:, :used], self._points[:, : max(filled, NEIGHBOURS)])
+            return backend.full((mask.shape[0],), 0, np.float32)
+        squared = _squared_distances(points[:, :used], self._points[:, : max(filled, NEIGHBOURS)])
         if backend.is_numpy:
             nearest = np.sort(np.partition(squared, NEIGHBOURS - 1, axis=2)[:, :, :NEIGHBOURS], axis=2)
         else:
@@ -188,14 +210,16 @@ class ContactMemory:
 class SurfaceDistance:
     """Chamfer-L2 (metric units) between accumulated contact points and the true surface, kept up to date step by step."""
 
+    REMEMBERED = ("nearest", "sum", "total", "last", "first")
+
     def __init__(self, num_envs: int, backend: Backend) -> None:
         self._backend = backend
-        self._surface = backend.zeros((num_envs, SURFACE_SUBSAMPLE, 3), np.float32)
+        self._surface = backend.full((num_envs, SURFACE_SUBSAMPLE, 3), 0, np.float32)
         self._nearest = backend.full((num_envs, SURFACE_SUBSAMPLE), np.inf, np.float32)  # squared, surface to contacts
-        self._sum = backend.zeros(num_envs, np.float32)  # of squared distances, contacts to surface
-        self._count = backend.zeros(num_envs, np.int64)
-        self._last = backend.zeros(num_envs, np.float32)
-        self._first = backend.zeros(num_envs, np.float32)
+        self._sum = backend.full((num_envs,), 0, np.float32)  # of squared distances, contacts to surface
+        self._total = backend.full((num_envs,), 0, np.int64)
+        self._last = backend.full((num_envs,), 0, np.float32)
+        self._first = backend.full((num_envs,), 0, np.float32)
 
     def set(self, env: int, points: np.ndarray) -> None:
         """The true surface of one environment, (SURFACE_SUBSAMPLE, 3) world frame, metres."""
@@ -205,7 +229,7 @@ class SurfaceDistance:
         """Forgets the contacts of ``envs``."""
         chosen = list(envs)
         self._nearest[chosen] = np.inf
-        for value in (self._sum, self._count, self._last, self._first):
+        for value in (self._sum, self._total, self._last, self._first):
             value[chosen] = 0
 
     def step(self, points: Array, mask: Array) -> Array:
@@ -213,16 +237,16 @@ class SurfaceDistance:
         backend, xp = self._backend, self._backend.module
         used = max(1, int(mask.sum(1).max())) if backend.is_numpy else mask.shape[1]
         mask = mask[:, :used]
-        squared = _squared_distances(backend, points[:, :used] * (1.0 / WORKSPACE_EDGE), self._surface)
+        squared = _squared_distances(points[:, :used] * (1.0 / WORKSPACE_EDGE), self._surface)
         squared = xp.where(mask[:, :, None], squared, backend.full((1, 1, 1), np.inf, np.float32))
         self._nearest = xp.minimum(self._nearest, squared.min(1) if backend.is_numpy else squared.min(1).values)
         to_surface = squared.min(2) if backend.is_numpy else squared.min(2).values
         self._sum = self._sum + xp.where(mask, to_surface, 0.0 * self._sum[:, None]).sum(1)
-        self._count = self._count + mask.sum(1)
-        known = self._count > 0
+        self._total = self._total + mask.sum(1)
+        known = self._total > 0
         nearest = xp.where(known[:, None], self._nearest, 0.0 * self._sum[:, None])
-        now = 0.5 * (nearest.sum(1) / SURFACE_SUBSAMPLE + self._sum / backend.clip(self._count, 1, 1 << 30))
-        now = now.astype(np.float32) if backend.is_numpy else now.to(xp.float32)
+        now = 0.5 * (nearest.sum(1) / SURFACE_SUBSAMPLE + self._sum / backend.clip(self._total, 1, 1 << 30))
+        now = backend.cast(now, np.float32)
         started = self._first > 0
         gain = xp.where(started, (self._last - now) / xp.where(started, self._first, self._first + 1.0), 0.0 * now)
         self._first = xp.where(started | ~known, self._first, now)
@@ -245,11 +269,16 @@ class AlphaShapes:
         for env in envs:
             self._shapes[env] = None
 
-    def step(self, memory: ContactMemory, mask: Array, backend: Backend) -> Array:
-        """(E,) float32 disagreement in metric units."""
+    def recall(self, envs: Sequence[int], memory: ContactMemory) -> None:
+        """Makes the shapes of ``envs`` anew from the known points: they follow from them."""
+        for env in envs:
+            points = thin_out(memory.known(env))
+            self._shapes[env] = (points, alpha_shape_samples(points)) if len(points) else None
+
+    def step(self, memory: ContactMemory, fresh: np.ndarray) -> np.ndarray:
+        """(E,) float32 disagreement in metric units, for environments that have new points where ``fresh`` (E,) is set."""
         reward = np.zeros(len(self._shapes), dtype=np.float32)
-        fresh = mask.any(1)
-        for env in np.flatnonzero(fresh if backend.is_numpy else fresh.cpu().numpy()):
+        for env in np.flatnonzero(fresh):
             points, before = thin_out(memory.known(int(env))), self._shapes[env]
             if before is not None and np.array_equal(points, before[0]):
                 continue
@@ -257,4 +286,4 @@ class AlphaShapes:
             if before is not None:
                 reward[env] = chamfer_l2(before[1], samples) / WORKSPACE_EDGE**2
             self._shapes[env] = points, samples
-        return backend.array(reward)
+        return reward

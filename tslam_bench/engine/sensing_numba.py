@@ -1,93 +1,99 @@
-"""Touch and coverage on the CPU: :class:`TactileSensing` as compiled loops, with the same bits.
+"""Touch and coverage on the CPU, as compiled loops.
 
-The array code of :mod:`tslam_bench.engine.sensing` spends its time moving tens of thousands of intermediate numbers through
-memory. Here every probe and volume point is carried through in registers, operation by operation in the same order and in
-float32, so that the results are equal bit for bit (tested); the compiler is not allowed to reorder or fuse them.
+Every probe and volume point is carried through in registers, in float32 and in a fixed order that the compiler is not
+allowed to change, so that bits depend neither on the batch nor on the machine's vector width.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from tslam_bench.constants import GRID_SIZE, VOXEL_EDGE, WORKSPACE_LOW
+from tslam_bench.constants import GRID_SIZE, TOUCH_DISTANCE, VOXEL_EDGE, WORKSPACE_LOW
 from tslam_bench.engine.arrays import NumpyBackend
-from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, VOXELS, Contacts, TactileSensing
-from tslam_bench.engine.skin import Skin
+from tslam_bench.engine.field_atlas import Fields
+from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, VOXELS, Contacts, Sensing
+from tslam_bench.engine.skin import PointSet, Skin
 from tslam_bench.hand_constants import SKIN_LINKS
 
+BLOCK_EDGE: Final = 25e-3
+"""Probes of a link are tested for nearness in blocks of this edge (m)."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-12)
 _SIZE, _NOT_IN_GRID, _OUTSIDE = np.int32(GRID_SIZE), np.int32(~(GRID_SIZE - 1)), np.int32(-1)
 _LOW, _PER_EDGE = np.float32(WORKSPACE_LOW), np.float32(1 / VOXEL_EDGE)
 
 
-class CompiledSensing(TactileSensing):
-    """:class:`TactileSensing` on numpy arrays, compiled.
+class CompiledSensing(Sensing):
+    """:class:`Sensing` on numpy arrays.
 
     Args:
         num_envs: E.
         skin: probes and volume points.
-        occupancy: (E, 2, 32, 32, 32) uint8 array to keep the touched (channel 0) and visited (1) grids in, for whoever
-            wants to read them where they are; None makes one.
+        occupancy: (E, 2, 32, 32, 32) uint8 array to keep the grids in, for whoever wants to read them where they are; None
+            makes one.
     """
 
     def __init__(self, num_envs: int, skin: Skin, occupancy: NDArray[np.uint8] | None = None) -> None:
         shape = (num_envs, 2, GRID_SIZE, GRID_SIZE, GRID_SIZE)
-        self.occupancy = np.zeros(shape, dtype=np.uint8) if occupancy is None else occupancy
-        if self.occupancy.shape != shape or self.occupancy.dtype != np.uint8:
-            raise ValueError(f"occupancy: {self.occupancy.shape} {self.occupancy.dtype}, expected {shape} uint8")
+        self._occupancy = np.zeros(shape, dtype=np.uint8) if occupancy is None else occupancy
+        if self._occupancy.shape != shape or self._occupancy.dtype != np.uint8:
+            raise ValueError(f"occupancy: {self._occupancy.shape} {self._occupancy.dtype}, expected {shape} uint8")
         super().__init__(num_envs, skin, NumpyBackend())
-        self._volume_starts = np.searchsorted(skin.volume.link, np.arange(len(SKIN_LINKS) + 1))
-        self._clear_grids(range(num_envs))
-
-    @override
-    def _make_grids(self) -> None:
-        self._grids = self.occupancy.reshape(self.num_envs, 2, VOXELS)
-        self._steps = np.full((self.num_envs, VOXELS), -1, dtype=np.int16)
-
-    @property
-    @override
-    def touched(self) -> NDArray[np.bool_]:
-        """(E, 32, 32, 32) bool, touched since the episode began; a view."""
-        return self.occupancy[:, 0].view(np.bool_)
+        blocks, block_of_probe = _blocks(skin.probes)
+        self._blocks = (blocks.link, _columns(blocks), blocks.radius, block_of_probe)
+        self._probes = (skin.probes.link, _columns(skin.probes), skin.probes.radius + np.float32(TOUCH_DISTANCE))
+        self._volume = (np.searchsorted(skin.volume.link, np.arange(len(SKIN_LINKS) + 1)), _columns(skin.volume))
+        self._first_probe = np.searchsorted(skin.probes.link, np.arange(len(SKIN_LINKS)))
+        self._grids = self._occupancy.reshape(num_envs, 2, VOXELS)
+        self._steps = np.full((num_envs, VOXELS), -1, dtype=np.int16)
 
     @property
     @override
-    def visited(self) -> NDArray[np.bool_]:
-        """(E, 32, 32, 32) bool, visited since the episode began; a view."""
-        return self.occupancy[:, 1].view(np.bool_)
+    def occupancy(self) -> NDArray[np.uint8]:
+        """(E, 2, 32, 32, 32) uint8; the array itself, which the next step changes."""
+        return self._occupancy
 
     @property
     @override
     def touched_step(self) -> NDArray[np.int16]:
-        """(E, 32, 32, 32) int16, control step (0 = first) of the first touch, -1 where never touched; a view."""
         return self._steps.reshape(self.num_envs, GRID_SIZE, GRID_SIZE, GRID_SIZE)
 
     @override
-    def _clear_grids(self, envs: Sequence[int]) -> None:
-        for env in envs:
-            self._grids[env] = 0
-            self._steps[env] = -1
+    def begin(self, envs: Sequence[int]) -> None:
+        self._fields: Fields = self.atlas.bound()
+        chosen = list(envs)
+        self._on[chosen] = False
+        self._grids[chosen] = 0
+        self._steps[chosen] = -1
+
+    @override
+    def set_state(self, envs: Sequence[int], state: Mapping[str, Any]) -> None:
+        chosen = list(envs)
+        self._on[chosen] = state["on"]
+        self._occupancy[chosen] = state["occupancy"]
+        self.touched_step[chosen] = state["touched_step"]
 
     @override
     def step(self, link_matrices: NDArray[np.float32], step: NDArray) -> Contacts:
-        """See :meth:`TactileSensing.step`."""
         on, new, points, mask, new_touched = self._feel(link_matrices, step, mark=True)
         new_visited = np.zeros(self.num_envs, dtype=np.int64)
-        _visit(link_matrices, self._volume_starts, self._volume.local, self._grids, new_visited)
+        _visit(link_matrices, *self._volume, self._grids, new_visited)
         self._on = on
         return Contacts(on, new, points, mask, new_touched, new_visited)
 
-    @override
     def touches(self, link_matrices: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """See :meth:`TactileSensing.touches`."""
+        """(E, P) bool, probes that would be on for these link poses; changes nothing."""
         return self._feel(link_matrices, np.zeros(self.num_envs, dtype=np.int64), mark=False)[0]
+
+    @override
+    def link_touch(self) -> NDArray[np.uint8]:
+        return np.logical_or.reduceat(self._on, self._first_probe, axis=1).view(np.uint8)
 
     def _feel(self, link_matrices: NDArray[np.float32], step: NDArray, mark: bool) -> tuple[Any, ...]:
         """(on, new, points, mask, new_touched) of a step; with ``mark`` touched voxels and their step are kept."""
@@ -95,19 +101,41 @@ class CompiledSensing(TactileSensing):
         points = np.zeros((self.num_envs, MAX_NEW_CONTACTS, 3), dtype=np.float32)
         mask = np.zeros((self.num_envs, MAX_NEW_CONTACTS), dtype=np.bool_)
         new_touched = np.zeros(self.num_envs, dtype=np.int64)
+        fields = self._fields
         _touch(
             link_matrices,
-            self._turn,
-            (self._blocks.link, self._blocks.local, self._blocks.radius, self._block_of_probe),
-            (self._probes.link, self._probes.local, self._probe_reach),
-            (self.atlas.values, self._offset[:, 0], self._stride[:, :, 0], self._last_cell[:, :, 0]),
-            (self._origin[:, :, 0], self._inverse_spacing[:, 0], self._cull_margin[:, 0]),
+            fields.turn,
+            self._blocks,
+            self._probes,
+            (fields.values, fields.offset, fields.stride, fields.last_cell),
+            (fields.origin, fields.inverse_spacing, fields.cell_reach),
             step,
             (self._on, on, new),
             (points, mask),
             (mark, self._grids, self._steps, new_touched),
         )
         return on, new, points, mask, new_touched
+
+
+def _columns(points: PointSet) -> NDArray[np.float32]:
+    """(3, P) positions, contiguous per axis."""
+    return np.ascontiguousarray(points.position.T)
+
+
+def _blocks(probes: PointSet) -> tuple[PointSet, NDArray[np.int64]]:
+    """Blocks of neighbouring probes (centre, radius within which any of its probes can touch), and each probe's block."""
+    cell = np.floor(probes.position / BLOCK_EDGE).astype(np.int64)
+    _, block = np.unique(np.column_stack([probes.link, cell]), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    links, centres, radii = [], [], []
+    for index in range(int(block.max()) + 1):
+        position = probes.position[block == index].astype(np.float64)
+        centre = (position.min(axis=0) + position.max(axis=0)) / 2
+        reach = np.linalg.norm(position - centre, axis=1) + probes.radius[block == index] + TOUCH_DISTANCE
+        links.append(probes.link[block == index][0])
+        centres.append(centre)
+        radii.append(reach.max() + 1e-5)  # for rounding
+    return PointSet(np.array(links), np.array(centres, dtype=np.float32), np.array(radii, dtype=np.float32)), block
 
 
 @njit(cache=True)
@@ -197,9 +225,9 @@ def _touch(
                         + turn[2, i] * links[env, row, 2, j]
                     )
         offset, inverse = offsets[env], inverse_spacings[env]
-        stride_x, stride_y, stride_z = strides[0, env], strides[1, env], strides[2, env]
-        last_x, last_y, last_z = last_cells[0, env], last_cells[1, env], last_cells[2, env]
-        origin_x, origin_y, origin_z = origins[0, env], origins[1, env], origins[2, env]
+        stride_x, stride_y, stride_z = strides[env, 0], strides[env, 1], strides[env, 2]
+        last_x, last_y, last_z = last_cells[env, 0], last_cells[env, 1], last_cells[env, 2]
+        origin_x, origin_y, origin_z = origins[env, 0], origins[env, 1], origins[env, 2]
         for block in range(len(block_link)):
             pose = turned[block_link[block]]
             a, b, c = block_local[0, block], block_local[1, block], block_local[2, block]

@@ -8,20 +8,19 @@ the same convex hulls. Needs ``mujoco``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import CONTROL_STEP_SECONDS, SUBSTEPS
-from tslam_bench.engine import hand_batch, hand_workers, physics, worker_vector_env
+from tslam_bench.engine import physics
+from tslam_bench.engine.hand_batch import BatchSettings
 from tslam_bench.engine.starts import Start
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import (
@@ -182,39 +181,16 @@ def _soften(geom: Any, settings: MujocoSettings) -> None:
     geom.margin = settings.margin / 2  # MuJoCo adds those of the two geoms
 
 
-def _scenes(settings: MujocoSettings) -> Any:
-    """What takes the place of ``HandScene`` in ``tslam_bench.engine.hand_batch``: makes scenes that share one pool."""
-    pools: dict[Path, MujocoPool] = {}
-
-    def make(urdf: Path, _bodies: Any, table: bool = False) -> MujocoScene:
-        if table:
-            raise InvalidInputError("the MuJoCo peer has no table; measure TactileSLAM-v0")
-        return MujocoScene(pools.setdefault(urdf, MujocoPool(settings, urdf)))
-
-    return make
+def mujoco_scenes(
+    peer: MujocoSettings, urdf: Path, _: physics.PhysicsSettings, table: bool, count: int
+) -> list[MujocoScene]:
+    """What takes the place of ``hand_scene.physx_scenes``."""
+    if table:
+        raise InvalidInputError("the MuJoCo peer has no table; measure TactileSLAM-v0")
+    pool = MujocoPool(peer, urdf)
+    return [MujocoScene(pool) for _ in range(count)]
 
 
-@contextmanager
-def mujoco_batches(settings: MujocoSettings) -> Iterator[None]:
-    """Every ``HandBatch`` made inside simulates with MuJoCo."""
-    with mock.patch.object(hand_batch, "HandScene", _scenes(settings)):
-        yield
-
-
-_ENGINE_WORK: Final = hand_workers._work
-
-
-def _work(settings: MujocoSettings, *arguments: Any) -> None:
-    with mujoco_batches(settings):
-        _ENGINE_WORK(*arguments)
-
-
-def make_mujoco_vec(
-    num_envs: int,
-    settings: hand_batch.BatchSettings,
-    processes: int | None = None,
-    mujoco_settings: MujocoSettings | None = None,
-) -> worker_vector_env.TactileVectorEnv:
-    """``TactileVectorEnv`` whose workers simulate with MuJoCo; everything else is the engine's own code."""
-    with mock.patch.object(hand_workers, "_work", partial(_work, mujoco_settings or MujocoSettings())):
-        return worker_vector_env.TactileVectorEnv(num_envs, settings, processes)
+def with_mujoco(settings: BatchSettings, peer: MujocoSettings) -> BatchSettings:
+    """The same environments, simulated by MuJoCo; all else is the engine's own code, in worker processes too."""
+    return replace(settings, scenes=partial(mujoco_scenes, peer))

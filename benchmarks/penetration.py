@@ -10,7 +10,6 @@ peer is tried with ever more substeps until its depth is no greater than the eng
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from mujoco_peer import STIFF, MujocoSettings, mujoco_batches
+from mujoco_peer import STIFF, MujocoSettings, with_mujoco
 from numpy.typing import NDArray
 from report import machine, markdown_table, print_table, replace_section, write_json
 from rollouts import KINDS, TEN_OBJECTS, Hands, make_actor, run_episode
@@ -91,8 +90,10 @@ def statistics_of(depths: NDArray[np.float64]) -> dict[str, float]:
 
 def measure(config: Config, settings: MujocoSettings | None) -> dict[str, float]:
     """Statistics of the engine (None) or of a peer, all objects together."""
-    with contextlib.nullcontext() if settings is None else mujoco_batches(settings):
-        audits = pressing_audits(config.objects, config.poses)
+    engine = BatchSettings(split="test")
+    audits = pressing_audits(
+        config.objects, config.poses, engine if settings is None else with_mujoco(engine, settings)
+    )
     return statistics_of(np.concatenate([audit.depths for audit in audits.values()]))
 
 

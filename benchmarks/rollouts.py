@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import HORIZON, NUM_JOINTS
-from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.hand_batch import BatchSettings, HandBatch
 
 TEN_OBJECTS: Final = (
     *("mug", "stanfordbunny", "toruslarge", "wineglass", "hammer"),
@@ -117,10 +117,8 @@ class Hands:
 
     def __init__(self, num_envs: int, settings: BatchSettings) -> None:
         self.num_envs = num_envs
-        self.arrays: dict[str, NDArray] = {
-            name: np.zeros((num_envs, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()
-        }
-        self.batch = HandBatch(num_envs, settings, self.arrays)
+        self.batch = HandBatch(num_envs, settings)
+        self.arrays = self.batch.arrays
 
     def reset(self, seed: int, objects: Sequence[str] | None = None, poses: Sequence[int] | None = None) -> None:
         """Starts an episode everywhere; environment i has seed ``seed + i``."""

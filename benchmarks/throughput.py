@@ -24,7 +24,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
-from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, make_mujoco_vec, mujoco_batches
+from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, with_mujoco
 from report import machine, markdown_table, print_table, replace_section, write_json
 from rollouts import TEN_OBJECTS, exploring_actions
 from stages import STAGES, stage_costs
@@ -33,6 +33,8 @@ from tqdm import tqdm
 import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, REWARD_MODES
 from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.worker_vector_env import TactileVectorEnv
+from tslam_bench.wrappers import NumpyEnv
 
 MUJOCO_USUAL = MujocoSettings(substeps=15)
 """MuJoCo at its usual time step of 2 ms, with its own contact softness."""
@@ -99,27 +101,19 @@ class Side:
         return {"median": round(statistics.median(self.rates), 1), "min": round(low, 1), "max": round(high, 1)}
 
 
-class _Unbatched(gym.Wrapper):
-    """A ManiSkill environment as AsyncVectorEnv wants it: numpy without the batch dimension."""
+class _WithoutInfo(NumpyEnv):
+    """``info`` is left out: gathering it would cost AsyncVectorEnv time."""
 
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.observation_space = env.unwrapped.single_observation_space
-        self.action_space = env.unwrapped.single_action_space
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        return super().reset(**arguments)[0], {}
 
-    def reset(self, **kwargs):
-        observation, _ = self.env.reset(**kwargs)
-        return {key: value[0].numpy() for key, value in observation.items()}, {}
-
-    def step(self, action):
-        observation, reward, terminated, truncated, _ = self.env.step(action)
-        plain = {key: value[0].numpy() for key, value in observation.items()}
-        return plain, float(reward), bool(terminated), bool(truncated), {}
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return (*super().step(action)[:4], {})
 
 
 def _make_unbatched(objects: tuple[str, ...], reward_mode: str) -> gym.Env:
     torch.set_num_threads(1)
-    return _Unbatched(gym.make(ENVIRONMENT_ID, objects=objects, reward_mode=reward_mode))
+    return _WithoutInfo(gym.make(ENVIRONMENT_ID, objects=objects, reward_mode=reward_mode))
 
 
 def _vector_side(envs: gym.vector.VectorEnv, config: Config, episodes: int) -> Side:
@@ -143,8 +137,8 @@ def engine_side(config: Config, reward_mode: str | None = None) -> Side:
 
 def mujoco_side(config: Config, settings: MujocoSettings) -> Side:
     """The same engine on MuJoCo's physics."""
-    batch = BatchSettings(objects=config.objects, reward_mode=config.reward_mode)
-    envs = make_mujoco_vec(config.num_envs, batch, config.processes, settings)
+    batch = with_mujoco(BatchSettings(objects=config.objects, reward_mode=config.reward_mode), settings)
+    envs = TactileVectorEnv(config.num_envs, batch, config.processes)
     return _vector_side(envs, config, config.episodes)
 
 
@@ -211,8 +205,7 @@ def compare_stages(config: Config) -> dict[str, Any]:
     num_envs = max(1, config.num_envs // config.processes)
     settings = BatchSettings(objects=config.objects, reward_mode=config.reward_mode)
     engine = stage_costs(num_envs, settings)
-    with mujoco_batches(MujocoSettings()):
-        mujoco = stage_costs(num_envs, settings)
+    mujoco = stage_costs(num_envs, with_mujoco(settings, MujocoSettings()))
     share = (engine["sensing"] + engine["rewards"]) / engine["physics"]
     rounded = [{stage: round(value, 1) for stage, value in costs.items()} for costs in (engine, mujoco)]
     return {

@@ -20,9 +20,8 @@ from rich.console import Console
 from rich.table import Table
 from rollouts import Hands, PressingHands, run_episode
 
-from tslam_bench.constants import NUM_JOINTS, NUM_POSES, QUICK_OBJECTS
+from tslam_bench.constants import NUM_POSES, QUICK_OBJECTS
 from tslam_bench.engine.hand_batch import BatchSettings
-from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices
 from tslam_bench.engine.skin import build_skin
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.objects.hand import load_hand
@@ -70,17 +69,13 @@ class LastSubstep:
 
     def __init__(self, scene: Any) -> None:
         self._scene = scene
-        self._rows = scene.skin_rows()
-        self._joints = np.zeros((2, NUM_JOINTS), dtype=np.float32)
-        self._poses = np.zeros((1, scene.num_bodies, POSE_SIZE), dtype=np.float32)
         self.links = np.zeros((1, len(SKIN_LINKS), 3, 4), dtype=np.float32)
 
     def __call__(self) -> None:
         """One control step."""
         for _ in range(self._scene.settings.substeps - 1):
             self._scene.substep()
-        self._scene.read(*self._joints, self._poses[0])
-        link_matrices(self._poses, self._rows, self.links)
+        self.links[:] = self._scene.skin_matrices()
         self._scene.substep()
 
     def physx(self) -> tuple[NDArray[np.bool_], list[float]]:

@@ -21,7 +21,7 @@ from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS, REWARD_MODES
 from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
 from tslam_bench.engine.control import DriveTargets
 from tslam_bench.engine.gpu_memory import CONTACTS_PER_PAIR, HAND_SHAPES, TOUCHING_PAIRS, gpu_memory
-from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.hand_batch import BatchSettings, HandBatch
 from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
 from tslam_bench.engine.native_output import captured_output
 from tslam_bench.engine.rewards import Rewards
@@ -43,8 +43,8 @@ EPISODES = Episodes.draw(("mug", "hammer"), (0, 2, 5), ENVS)
 @pytest.fixture(scope="module")
 def simulated():
     """Link poses (T, E, L, 3, 4), joint positions (T, E, 28) and actions of real episodes."""
-    arrays = {name: np.zeros((ENVS, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
-    batch = HandBatch(ENVS, BatchSettings(objects=("mug", "hammer"), reward_mode="none"), arrays)
+    batch = HandBatch(ENVS, BatchSettings(objects=("mug", "hammer"), reward_mode="none"))
+    arrays = batch.arrays
     batch.reset(list(EPISODES.seeds), list(range(ENVS)), list(EPISODES.objects), list(EPISODES.poses))
     links, qpos = [], []
     for action in EPISODES.actions[:STEPS]:

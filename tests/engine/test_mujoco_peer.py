@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import mujoco
 import numpy as np
 import pytest
-from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, build_model, make_mujoco_vec, mujoco_batches
+from mujoco_peer import EQUAL_PENETRATION, MujocoSettings, build_model, with_mujoco
 from rollouts import Hands, PressingHands, run_episode
 from separation import REACH, SeparationRuler
 
 from tslam_bench.constants import NUM_JOINTS
 from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.worker_vector_env import TactileVectorEnv
 from tslam_bench.objects.hand import load_hand
 from tslam_bench.objects.store import load_object
 
@@ -40,9 +39,8 @@ def test_both_engines_settle_at_the_same_joint_positions():
     actions = generator.uniform(-0.8, 0.8, (4, NUM_JOINTS))
     actions[:, 1] = 1.0  # as high as the arm goes
     ends = []
-    for engine in (contextlib.nullcontext(), mujoco_batches(MujocoSettings())):
-        with engine:
-            hands = Hands(4, SETTINGS)
+    for settings in (SETTINGS, with_mujoco(SETTINGS, MujocoSettings())):
+        hands = Hands(4, settings)
         hands.reset(0)
         for _ in range(60):
             hands.step(actions)
@@ -53,8 +51,7 @@ def test_both_engines_settle_at_the_same_joint_positions():
 
 
 def test_peer_feels_the_object_and_stays_out_of_it():
-    with mujoco_batches(EQUAL_PENETRATION):
-        hands = Hands(2, BatchSettings(object="mug"))
+    hands = Hands(2, with_mujoco(BatchSettings(object="mug"), EQUAL_PENETRATION))
     ruler, felt, depths = SeparationRuler("mug", 0), [], []
 
     def look(_):
@@ -88,7 +85,7 @@ def test_ruler_measures_a_known_distance():
 
 @pytest.mark.slow
 def test_peer_runs_in_worker_processes():
-    envs = make_mujoco_vec(2, BatchSettings(object="mug"), processes=2)
+    envs = TactileVectorEnv(2, with_mujoco(BatchSettings(object="mug"), MujocoSettings()), processes=2)
     observation, _ = envs.reset(seed=0)
     start = observation["qpos"].copy()
     for _ in range(5):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tslam_bench.constants import NUM_POSES, WORKSPACE_EDGE
-from tslam_bench.engine.hand_batch import OBSERVATION_ARRAYS, BatchSettings, HandBatch, batch_arrays
+from tslam_bench.engine.hand_batch import BatchSettings, HandBatch
 from tslam_bench.engine.skin import build_skin
+from tslam_bench.engine.spaces import OBSERVATION_ARRAYS
 from tslam_bench.engine.starts import StartSampler
 from tslam_bench.episodes import episode_seed
 from tslam_bench.hand_constants import START_ARM_HIGH, START_ARM_LOW
@@ -19,8 +20,8 @@ PREPARED = [name for name in splits.OBJECTS if name in splits.prepared_names("te
 @pytest.mark.slow
 def test_equal_pose_and_seed_give_the_same_first_observation_for_all_test_objects():
     assert len(PREPARED) >= 5
-    arrays = {name: np.zeros((4, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
-    batch = HandBatch(4, BatchSettings(objects=tuple(PREPARED), split="test"), arrays)
+    batch = HandBatch(4, BatchSettings(objects=tuple(PREPARED), split="test"))
+    arrays = batch.arrays
     first: dict[tuple[int, int], dict[str, bytes]] = {}
     for index, name in enumerate(PREPARED):
         poses = [(index + offset) % NUM_POSES for offset in (0, 3, 4, 5)]
@@ -41,8 +42,7 @@ def test_the_start_box_is_clear_of_everything_that_the_gates_allow():
     heights = np.array(starts)[:, 1]
     assert heights.min() >= START_ARM_LOW[1] and heights.max() <= START_ARM_HIGH[1]
     assert heights.min() < START_ARM_LOW[1] + 1e-3 and heights.max() > START_ARM_HIGH[1] - 1e-3
-    arrays = {name: np.zeros((1, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
-    batch = HandBatch(1, BatchSettings(object=PREPARED[0], split="test"), arrays)
+    batch = HandBatch(1, BatchSettings(object=PREPARED[0], split="test"))
     points = build_skin(hand.shapes).volume
     lowest = []
     for seed in range(40):

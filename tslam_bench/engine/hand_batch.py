@@ -77,13 +77,16 @@ class HandBatch:
     Args:
         num_envs: K.
         settings: what they are.
-        arrays: the arrays of :func:`batch_arrays`, each (K, ...); actions are read from them, all else is written there.
+        arrays: the arrays of :func:`batch_arrays`, each (K, ...); actions are read from them, all else is written there. None
+            makes them.
     """
 
-    def __init__(self, num_envs: int, settings: BatchSettings, arrays: Mapping[str, NDArray]) -> None:
+    def __init__(self, num_envs: int, settings: BatchSettings, arrays: Mapping[str, NDArray] | None = None) -> None:
+        if arrays is None:
+            arrays = {name: np.zeros((num_envs, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
         hand, backend = load_hand(), NumpyBackend()
         self.num_envs = num_envs
-        self._arrays = arrays
+        self.arrays = arrays
         self._starts = settings.sampler()
         table = self._starts.variant.table
         self._scenes = settings.scenes(hand.urdf, settings.physics, table, num_envs)
@@ -135,7 +138,7 @@ class HandBatch:
             name = self.object_name[envs[int(np.flatnonzero(felt)[0])]]
             raise AssetError(f"{name}: touches the hand at the start, so it does not fit in the workspace")
         for name in (*STEP_ARRAYS, "touch", "time"):
-            self._arrays[name][list(envs)] = 0
+            self.arrays[name][list(envs)] = 0
 
     def step(self, repeat: int = 1) -> None:
         """``repeat`` control steps of all environments with the actions in the arrays; ended episodes start anew at once.
@@ -145,13 +148,13 @@ class HandBatch:
         """
         self._control_step()
         for _ in range(repeat - 1):
-            before = {name: self._arrays[name].copy() for name in SUMMED}
+            before = {name: self.arrays[name].copy() for name in SUMMED}
             self._control_step()
             for name, value in before.items():
-                self._arrays[name][:] += value
+                self.arrays[name][:] += value
 
     def _control_step(self) -> None:
-        arrays = self._arrays
+        arrays = self.arrays
         targets = self._targets(arrays["action"], arrays["qpos"])
         # Hand by hand: what setting the targets brings into the processor's cache, the physics and the reading need again.
         for env, (scene, target) in enumerate(zip(self._scenes, targets.tolist(), strict=True)):
@@ -173,7 +176,7 @@ class HandBatch:
             arrays["truncated"][:] = False
 
     def _start_anew(self, ended: NDArray) -> None:
-        arrays, kept = self._arrays, {}
+        arrays, kept = self.arrays, {}
         for name in OBSERVATION_ARRAYS:
             arrays[FINAL + name][ended] = arrays[name][ended]
         for name in SUMMED:
@@ -196,8 +199,8 @@ class HandBatch:
     def _gather(self) -> None:
         """From what was read to observed joints, in the order of ``JOINT_NAMES``, and link poses."""
         order = self._scenes[0].joint_order
-        self._arrays["qpos"][:] = self._qpos[:, order]
-        self._arrays["qvel"][:] = self._qvel[:, order]
+        self.arrays["qpos"][:] = self._qpos[:, order]
+        self.arrays["qvel"][:] = self._qvel[:, order]
         link_matrices(self._poses, self._skin_rows, self._links)
 
     def state(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The hand's skin: probe sites that sample touch, and volume points that sample where the hand has been (section 5).
 
-Both are fixed in link frames and made from the collision shapes by a deterministic rule, so they need no file. Bump
-``SKIN_VERSION`` when the rule changes.
+Both are fixed in link frames and made from the collision shapes by a deterministic rule, so they need no file. A change of the
+rule changes observations, so it bumps the environment ids.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.objects.hand import CollisionShape
 
-SKIN_VERSION = 1
 AXIS_SPACING = 3e-3
 """Largest distance between probes on a capsule's axis (m)."""
 FACE_SPACING = 5e-3

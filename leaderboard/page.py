@@ -61,25 +61,19 @@ def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
         leaderboard: what :func:`tslam_bench.leaderboard.ranking.rank` returned.
         images: pictures by kind, submission and object; what is missing is shown as missing.
     """
-    tables = [
-        _table_view(number, table, leaderboard, images) for number, table in enumerate(leaderboard["tables"], start=1)
-    ]
-    return (
-        _templates()
-        .get_template("page.html.jinja")
-        .render(
-            board=leaderboard,
-            tables=tables,
-            teaser=_teaser(leaderboard["tables"], images),
-            constants=constants,
-            counts=COUNTS,
-            seconds={count: round(count * constants.HORIZON * constants.CONTROL_STEP_SECONDS) for count in COUNTS},
-            figures=FIGURES,
-            iou_area=IOU_AREA,
-            exploration_area=EXPLORATION_AREA,
-            touched_as_they_are=TOUCHED_AS_THEY_ARE,
-            open_objects=OPEN_OBJECTS,
-        )
+    boards = leaderboard["tables"]
+    return _page_template().render(
+        board=leaderboard,
+        tables=[_table_view(number, table, leaderboard, images) for number, table in enumerate(boards, start=1)],
+        teaser=_teaser(boards, images),
+        constants=constants,
+        counts=COUNTS,
+        seconds={count: round(count * constants.HORIZON * constants.CONTROL_STEP_SECONDS) for count in COUNTS},
+        figures=FIGURES,
+        iou_area=IOU_AREA,
+        exploration_area=EXPLORATION_AREA,
+        touched_as_they_are=TOUCHED_AS_THEY_ARE,
+        open_objects=OPEN_OBJECTS,
     )
 
 
@@ -104,7 +98,7 @@ def group_explorers(entries: Sequence[dict[str, Any]]) -> list[Explorer]:
 # --- What the templates are given ------------------------------------------------------------------------------
 
 
-def _templates() -> jinja2.Environment:
+def _page_template() -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
@@ -123,7 +117,7 @@ def _templates() -> jinja2.Environment:
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii"),
         "web_address": lambda link: link if re.match("https?://", link) else "",
     }
-    return environment
+    return environment.get_template("page.html.jinja")
 
 
 def _table_view(
@@ -166,12 +160,12 @@ def _teaser(tables: Sequence[Mapping[str, Any]], images: Images) -> dict[str, An
     """What was felt, rebuilt and true, of the best ranked entry and the object it rebuilt best among those pictured."""
     for table in tables:
         for entry in sorted(table["entries"], key=lambda e: e["rank"] or math.inf):
+            key = entry["content_hash"]
             shown = {}
             for name in table["objects"]:
-                keys = [("touched", entry["content_hash"], name), ("reconstruction", entry["content_hash"], name)]
-                keys.append(("truth", "", name))
-                if all(key in images for key in keys):
-                    shown[name] = [images[key] for key in keys]
+                wanted = (("touched", key, name), ("reconstruction", key, name), ("truth", "", name))
+                if all(picture in images for picture in wanted):
+                    shown[name] = [images[picture] for picture in wanted]
             if shown:
                 name = max(shown, key=lambda name: _iou_at_8(entry, name))
                 return {"name": name, "entry": entry, "iou": _iou_at_8(entry, name), "pictures": shown[name]}
@@ -215,11 +209,7 @@ def _iou_charts(explorers: Sequence[Explorer], reconstructors: Sequence[str]) ->
 
 
 def _gallery_object(
-    name: str,
-    entries: Sequence[Mapping[str, Any]],
-    explorers: Sequence[Explorer],
-    reconstructors: Sequence[str],
-    images: Images,
+    name: str, entries: Sequence[Any], explorers: Sequence[Explorer], reconstructors: Sequence[str], images: Images
 ) -> dict[str, Any]:
     """Pictures of one object: a row for each explorer, with the reconstructions of its touches."""
     ranked = [entry for entry in entries if entry["rank"] is not None]

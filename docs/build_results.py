@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +20,18 @@ from sections import filled, write_or_check
 
 from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.files import write_json
+from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, MISSING, Figure, interval, means, number
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 
 ROOT: Final = Path(__file__).parent.parent
 KEPT: Final = ROOT / "leaderboard" / "results" / "scripted.json"
 PAGE: Final = ROOT / "docs" / "results.md"
 README: Final = ROOT / "README.md"
-POSES: Final = ("1", "2", "4", "8")
 README_RECONSTRUCTORS: Final = ("ifnet", "carve")
+COUNTS: Final = tuple(str(count) for count in RECONSTRUCTED_POSES)
+COLUMNS: Final = tuple(
+    figure for figure in FIGURES if figure.metric in ("iou", "calibration_error", "chamfer_l2", "normal_consistency")
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ def touched_voxels(run: Path) -> dict[str, float]:
 
 
 def kept_figures(run: Path) -> dict[str, Any]:
-    """What is kept of a run: aggregates, ranks, means per number of poses, touched voxels.
+    """What is kept of a run: aggregates, ranks, touched voxels.
 
     Raises:
         InvalidInputError: the run is not finished, or holds more than one table.
@@ -65,8 +70,6 @@ def kept_figures(run: Path) -> dict[str, Any]:
     (table,) = board["tables"]
     entries = []
     for entry in table["entries"]:
-        rows = entry["per_object"].values()
-        recall = {count: _mean(row[count]["touched_surface_recall"] for row in rows) for count in POSES}
         info = entry["submission"]
         entries.append(
             {
@@ -76,7 +79,6 @@ def kept_figures(run: Path) -> dict[str, Any]:
                 "behind_leader": entry["behind_leader"],
                 "aggregate": entry["aggregate"],
                 "improvement": entry["improvement"],
-                "recall": recall,
                 "seeds": len(info["seeds"]),
                 "iou_area_per_object": {name: row["areas"]["iou_area"] for name, row in entry["per_object"].items()},
             }
@@ -84,15 +86,10 @@ def kept_figures(run: Path) -> dict[str, Any]:
     return {"objects": len(table["objects"]), "touched_voxels": touched_voxels(run), "entries": entries}
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = list(values)
-    return None if any(value is None for value in known) else float(np.mean([float(v) for v in known if v is not None]))
-
-
 def exploration_table(kept: Mapping[str, Any]) -> str:
     """Touched voxels and surface, a row per explorer."""
     lines = [
-        "| explorer | touched voxels per pose | surface touched after 1 / 2 / 4 / 8 poses | touch area |",
+        f"| explorer | touched voxels per pose | surface touched after {' / '.join(COUNTS)} poses | {EXPLORATION_AREA.short} |",
         "|---|---|---|---|",
     ]
     seen = {}
@@ -100,48 +97,41 @@ def exploration_table(kept: Mapping[str, Any]) -> str:
         if entry["explorer"] in kept["touched_voxels"]:
             seen.setdefault(entry["explorer"], entry)
     for name, entry in sorted(seen.items(), key=lambda item: -kept["touched_voxels"][item[0]]):
-        recall = " / ".join(f"{entry['recall'][count]:.3f}" for count in POSES)
-        area = entry["aggregate"]["areas"]["exploration_area"]
-        lines.append(f"| `{name}` | {kept['touched_voxels'][name]:.0f} | {recall} | {_interval(area)} |")
+        groups = entry["aggregate"]
+        recall = " / ".join(number(groups[count]["touched_surface_recall"]["mean"]) for count in COUNTS)
+        area = _with_interval(groups, EXPLORATION_AREA)
+        lines.append(f"| `{name}` | {kept['touched_voxels'][name]:.0f} | {recall} | {area} |")
     return "\n".join(lines)
 
 
-def _interval(estimate: Mapping[str, float]) -> str:
-    return f"{estimate['mean']:.3f} ({estimate['low']:.3f} to {estimate['high']:.3f})"
-
-
-def score_table(kept: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> str:
+def score_table(entries: Sequence[Mapping[str, Any]]) -> str:
     """Scores, a row per entry."""
-    lines = [
-        "| rank | explorer | reconstructor | IoU area (95 %) | 1 | 2 | 4 | 8 | CD-L2 x100 | NC | ECE | P(better) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = ("rank", "explorer", "reconstructor", f"{IOU_AREA.short} (95 %)", *(f.short for f in COLUMNS), "P(better)")
+    lines = [f"| {' | '.join(heads)} |", "|" + len(heads) * "---|"]
     for entry in entries:
-        groups = entry["aggregate"]
-        ious = " | ".join(f"{groups[count]['iou']['mean']:.3f}" for count in POSES)
-        at_8 = groups["8"]
-        calibration = at_8.get("calibration_error")
+        values = means(entry["aggregate"])
         cells = (
-            "-" if entry["rank"] is None else str(entry["rank"]),
+            str(entry["rank"] or MISSING),
             f"`{entry['explorer']}`",
             f"`{entry['reconstructor']}`",
-            _interval(groups["areas"]["iou_area"]),
-            ious,
-            f"{100 * at_8['chamfer_l2']['mean']:.3f}",
-            f"{at_8['normal_consistency']['mean']:.3f}",
-            "-" if calibration is None else f"{calibration['mean']:.3f}",
-            "-" if entry["improvement"] is None else f"{entry['improvement']:.2f}",
+            _with_interval(entry["aggregate"], IOU_AREA),
+            *(figure.text(values) for figure in COLUMNS),
+            number(entry["improvement"], 2),
         )
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _with_interval(groups: Mapping[str, Any], figure: Figure) -> str:
+    return f"{figure.text(means(groups))} ({interval(groups[figure.group][figure.metric])})"
 
 
 def texts_of(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
     """Page -> section -> text."""
     short = [entry for entry in kept["entries"] if entry["reconstructor"] in README_RECONSTRUCTORS]
     return {
-        PAGE: {"exploration": exploration_table(kept), "scores": score_table(kept, kept["entries"])},
-        README: {"results": score_table(kept, short)},
+        PAGE: {"exploration": exploration_table(kept), "scores": score_table(kept["entries"])},
+        README: {"results": score_table(short)},
     }
 
 

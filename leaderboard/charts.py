@@ -1,14 +1,14 @@
-"""Line charts as inline SVG. Colours come from the page's style sheet (classes ``c0`` to ``c11``), so both modes work."""
+"""Line charts: where everything goes. ``templates/chart.html.jinja`` draws them as SVG, in the style sheet's colours."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Final
 
 COLOURS: Final = 12
 """Number of line colours in the style sheet; a thirteenth line takes the first again, dashed."""
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Line:
 
     label: str
     colour: int
-    points: Sequence[tuple[float, float]]
+    points: Sequence[Point]
     dashed: bool = False
 
 
@@ -37,6 +37,49 @@ class Axis:
     high: float
     ticks: Sequence[tuple[float, str]]
 
+    def share(self, value: float) -> float:
+        """Where a value is between the ends of the axis: 0 to 1."""
+        return (value - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class DrawnLine:
+    """A line in user units of the drawing, x to the right and y down.
+
+    Attributes:
+        line: what is drawn.
+        points: (x, y) of its points.
+        label_y: height of the label at its end, or None.
+    """
+
+    line: Line
+    points: Sequence[Point]
+    label_y: float | None
+
+    @property
+    def style(self) -> str:
+        """Classes of the style sheet."""
+        return line_style(self.line.colour, self.line.dashed)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart in user units: size, frame of the plot, ticks (position, text) and lines."""
+
+    title: str
+    width: int
+    height: int
+    left: int
+    right: int
+    top: int
+    bottom: int
+    x_title: str
+    y_title: str
+    x_ticks: Sequence[tuple[float, str]]
+    y_ticks: Sequence[tuple[float, str]]
+    lines: Sequence[DrawnLine]
+    markers: bool
+
 
 def line_chart(
     title: str,
@@ -46,67 +89,48 @@ def line_chart(
     size: tuple[int, int] = (760, 360),
     end_labels: bool = True,
     markers: bool = False,
-) -> str:
-    """An SVG element with a title for screen readers.
+) -> Chart:
+    """Places lines, ticks and labels.
 
     Args:
-        size: width and height in user units; the element scales with its container.
+        title: for screen readers.
+        size: width and height in user units; the drawing scales with its container.
         end_labels: write each line's label at its right end, moved apart where they would meet.
         markers: a dot at every point.
     """
     width, height = size
-    left, right, top, bottom = 54, (150 if end_labels else 14), 14, 46
-    plot_width, plot_height = width - left - right, height - top - bottom
+    left, right, top, bottom = 54, width - (150 if end_labels else 14), 14, height - 46
 
-    def place(point: tuple[float, float]) -> tuple[float, float]:
-        u = (point[0] - x.low) / (x.high - x.low)
-        v = (point[1] - y.low) / (y.high - y.low)
-        return left + u * plot_width, top + (1 - v) * plot_height
+    def across(value: float) -> float:
+        return round(left + x.share(value) * (right - left), 1)
 
-    parts = [f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">']
-    parts.append(f"<title>{escape(title)}</title>")
-    for value, text in y.ticks:
-        _, at = place((x.low, value))
-        parts.append(f'<line class="grid" x1="{left}" y1="{at:.1f}" x2="{width - right}" y2="{at:.1f}"/>')
-        parts.append(f'<text class="tick" x="{left - 8}" y="{at + 4:.1f}" text-anchor="end">{escape(text)}</text>')
-    for value, text in x.ticks:
-        at, _ = place((value, y.low))
-        parts.append(f'<line class="grid" x1="{at:.1f}" y1="{top}" x2="{at:.1f}" y2="{top + plot_height}"/>')
-        parts.append(
-            f'<text class="tick" x="{at:.1f}" y="{top + plot_height + 18}" text-anchor="middle">{escape(text)}</text>'
-        )
-    middle = top + plot_height / 2
-    parts.append(
-        f'<text class="axis" x="{left + plot_width / 2:.0f}" y="{height - 8}" text-anchor="middle">'
-        f"{escape(x.title)}</text>"
-    )
-    parts.append(
-        f'<text class="axis" transform="rotate(-90 14 {middle:.0f})" x="14" y="{middle:.0f}" text-anchor="middle">'
-        f"{escape(y.title)}</text>"
-    )
-    for line in lines:
-        placed = [place(point) for point in line.points]
-        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in placed)
-        style = f"line c{line.colour % COLOURS}" + (" dashed" if line.dashed or line.colour >= COLOURS else "")
-        parts.append(f'<polyline class="{style}" points="{path}"><title>{escape(line.label)}</title></polyline>')
-        if markers:
-            parts += [
-                f'<circle class="dot c{line.colour % COLOURS}" cx="{a:.1f}" cy="{b:.1f}" r="3">'
-                f"<title>{escape(line.label)}: {value:.3f}</title></circle>"
-                for (a, b), (_, value) in zip(placed, line.points, strict=True)
-            ]
+    def down(value: float) -> float:
+        return round(bottom - y.share(value) * (bottom - top), 1)
+
+    placed = [[(across(a), down(b)) for a, b in line.points] for line in lines]
+    heights: Sequence[float | None] = [None] * len(lines)
     if end_labels:
-        ends = [place(line.points[-1])[1] for line in lines]
-        rows = _spread(ends, 14, top + 6, top + plot_height)
-        for line, end, row in zip(lines, ends, rows, strict=True):
-            start = width - right
-            style = f"c{line.colour % COLOURS}"
-            parts.append(
-                f'<polyline class="leader {style}" points="{start},{end:.1f} {start + 10},{row:.1f}"/>'
-                f'<text class="end {style}" x="{start + 14}" y="{row + 4:.1f}">{escape(line.label)}</text>'
-            )
-    parts.append("</svg>")
-    return "".join(parts)
+        heights = _spread([points[-1][1] for points in placed], 14, top + 6, bottom)
+    return Chart(
+        title=title,
+        width=width,
+        height=height,
+        left=left,
+        right=right,
+        top=top,
+        bottom=bottom,
+        x_title=x.title,
+        y_title=y.title,
+        x_ticks=[(across(value), text) for value, text in x.ticks],
+        y_ticks=[(down(value), text) for value, text in y.ticks],
+        lines=[DrawnLine(*drawn) for drawn in zip(lines, placed, heights, strict=True)],
+        markers=markers,
+    )
+
+
+def line_style(colour: int, dashed: bool) -> str:
+    """Classes of the style sheet for a line, its dots, its label and its swatch."""
+    return f"c{colour % COLOURS}" + (" dashed" if dashed or colour >= COLOURS else "")
 
 
 def _spread(values: Sequence[float], gap: float, low: float, high: float) -> list[float]:
@@ -120,5 +144,5 @@ def _spread(values: Sequence[float], gap: float, low: float, high: float) -> lis
         rows[k] = min(rows[k], high if k == len(rows) - 1 else rows[k + 1] - gap)
     result = [0.0] * len(values)
     for k, row in zip(order, rows, strict=True):
-        result[k] = row
+        result[k] = round(row, 1)
     return result

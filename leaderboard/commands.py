@@ -1,29 +1,23 @@
-"""``tslam-bench score`` and ``tslam-bench leaderboard``."""
+"""``tslam-bench leaderboard``: from submissions and score files to a ranking and its page."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sys
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import tyro
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
-from tqdm import tqdm
 
+from tslam_bench.cli.score import check_workers, progress
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.aggregate import Estimate
-from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
-from tslam_bench.scoring.submission import INFO_FILE, RECONSTRUCTED_POSES, Submission, read_submission
+from tslam_bench.scoring.scoring import SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.submission import INFO_FILE, Submission, read_submission
 
 from .page import build_page
 from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
@@ -32,23 +26,6 @@ from .ranking import rank
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"
 PICTURE_FOLDER: Final = ".pictures"
-_SHAPE_HEADS: Final = ("CD-L2\nx1e-2", "CD-L1", "NC", "F 1%", "F 2%", "surf.\nIoU")
-
-
-@dataclass(frozen=True)
-class ScoreArguments:
-    """Scores submissions against the prepared test objects: a table, and JSON on request."""
-
-    submissions: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders or zip archives that hold submission.json."""
-    output: Path | None = None
-    """JSON file for the scores; with several submissions, a folder that gets one file each, as soon as it is scored."""
-    objects: tuple[str, ...] = ()
-    """Objects to score; empty: those of the submission's object set."""
-    workers: int = 1
-    """Processes."""
-    json: bool = False
-    """Print JSON instead of a table."""
 
 
 @dataclass(frozen=True)
@@ -72,39 +49,6 @@ class LeaderboardArguments:
     """Print the ranking as JSON."""
 
 
-def score_main(arguments: Sequence[str]) -> None:
-    """Runs ``tslam-bench score``.
-
-    Raises:
-        BenchmarkError: bad input; the message is one line.
-    """
-    parsed = tyro.cli(ScoreArguments, args=list(arguments), prog="tslam-bench score")
-    if not parsed.submissions:
-        raise InvalidInputError("score: name at least one submission, a folder or a zip archive")
-    _check_workers(parsed.workers)
-    files = _score_files(parsed.submissions, parsed.output)
-    scores = []
-    with worker_pool(parsed.workers) as pool:
-        for path, file in zip(parsed.submissions, files, strict=True):
-            with _progress(f"score {path.name}", "object") as show:
-                scores.append(score_submission(path, parsed.objects or None, pool, show))
-            if file is not None:
-                write_json(file, scores[-1].to_json())
-    if parsed.json:
-        values = [score.to_json() for score in scores]
-        print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
-        return
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=170)  # a file or a pipe has no width
-    console.print(summary_table(scores))
-    for score in scores:
-        if len(scores) == 1:
-            console.print(object_table(score))
-        for note in score.notes:
-            console.print(f"[yellow]note[/] {score.info.method}: {note}", highlight=False)
-
-
 def page_main(arguments: Sequence[str]) -> None:
     """Runs ``tslam-bench leaderboard``.
 
@@ -112,7 +56,7 @@ def page_main(arguments: Sequence[str]) -> None:
         BenchmarkError: bad input; the message is one line.
     """
     parsed = tyro.cli(LeaderboardArguments, args=list(arguments), prog="tslam-bench leaderboard")
-    _check_workers(parsed.workers)
+    check_workers(parsed.workers)
     paths = [*parsed.paths, *([parsed.scores] if parsed.scores else [])]
     if not paths:
         raise InvalidInputError("leaderboard: name submissions, score files or a folder that holds them")
@@ -129,7 +73,7 @@ def page_main(arguments: Sequence[str]) -> None:
     leaderboard = rank(scores)
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
-    with _progress("pictures", "picture") as show:
+    with progress("pictures", "picture") as show:
         drawn = make_pictures(
             list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, show
         )
@@ -198,64 +142,6 @@ def plan_pictures(
     return pictures
 
 
-def summary_table(scores: Sequence[SubmissionScore]) -> Table:
-    """One row per submission."""
-    table = Table(
-        title="Scores: IoU area is the mean of the IoU after 1, 2, 4 and 8 poses; all that names no number is after 8",
-        title_justify="left",
-        box=SIMPLE,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("method", no_wrap=True)
-    names = ("IoU\narea", "95 %", *(f"IoU {count}" for count in RECONSTRUCTED_POSES), "ECE", *_SHAPE_HEADS)
-    for name in (*names, "recall", "explor.\narea"):
-        table.add_column(name, justify="right", no_wrap=name != "95 %")
-    for score in scores:
-        at_8, areas = score.aggregate["8"], score.aggregate["areas"]
-        area = areas["iou_area"]
-        table.add_row(
-            score.info.method + (" (privileged)" if score.info.privileged else ""),
-            _mean(area),
-            f"{area.low:.2f}-{area.high:.2f}",
-            *(_mean(score.aggregate[str(count)]["iou"]) for count in RECONSTRUCTED_POSES),
-            _mean(at_8.get("calibration_error")),
-            _mean(at_8["chamfer_l2"], 4, 100),
-            *(_mean(at_8.get(name)) for name in ("chamfer_l1", "normal_consistency", "f_score_1", "f_score_2")),
-            *(_mean(at_8.get(name)) for name in ("surface_iou", "touched_surface_recall")),
-            _mean(areas.get("exploration_area")),
-        )
-    return table
-
-
-def object_table(score: SubmissionScore) -> Table:
-    """One row per object and seed of one submission."""
-    title = f"{score.info.method}, per object; all that names no number is after 8 poses"
-    table = Table(title=title, title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
-    names = ("object", "seed", "IoU\narea", *(f"IoU {count}" for count in RECONSTRUCTED_POSES), "ECE", *_SHAPE_HEADS)
-    for name in (*names, "recall", "explor.\narea", "remark"):
-        table.add_column(name, justify="left" if name in ("object", "remark") else "right")
-    for result in score.results:
-        values = result.poses["8"]
-        table.add_row(
-            result.object,
-            str(result.seed),
-            _number(result.areas["iou_area"]),
-            *(_number(result.poses[str(count)]["iou"]) for count in RECONSTRUCTED_POSES),
-            _number(values["calibration_error"]),
-            _number(values["chamfer_l2"], 4, 100),
-            *(_number(values[name]) for name in ("chamfer_l1", "normal_consistency", "f_score_1", "f_score_2")),
-            *(_number(values[name]) for name in ("surface_iou", "touched_surface_recall")),
-            _number(result.areas["exploration_area"]),
-            _remark(result),
-        )
-    return table
-
-
-def _remark(result: ObjectScore) -> str:
-    """Why reconstructions count as empty: "8: missing"."""
-    return "; ".join(f"{count}: {reason}" for count, reason in result.reasons.items() if reason is not None)
-
-
 def _score_missing(
     scores: list[SubmissionScore], submissions: dict[str, tuple[Path, Submission]], workers: int
 ) -> list[SubmissionScore]:
@@ -265,7 +151,7 @@ def _score_missing(
     missing = [path for key, (path, _) in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for path in missing:
-            with _progress(f"score {path.name}", "object") as show:
+            with progress(f"score {path.name}", "object") as show:
                 current.append(score_submission(path, None, pool, show))
     return current
 
@@ -291,40 +177,3 @@ def _read_score(path: Path) -> SubmissionScore:
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"{path}: not a score file ({error}); score the submission again") from error
     return SubmissionScore.from_json(value, str(path))
-
-
-def _score_files(paths: Sequence[Path], output: Path | None) -> list[Path | None]:
-    """Where the score of each submission goes, or None; known before hours of scoring, not after."""
-    if output is None:
-        return [None] * len(paths)
-    if len(paths) == 1:
-        return [output / f"{paths[0].stem}.json" if output.is_dir() else output]
-    names = [path.stem for path in paths]
-    if len(set(names)) != len(names):
-        raise InvalidInputError("score: two submissions have the same name; write them to different folders")
-    return [output / f"{name}.json" for name in names]
-
-
-def _check_workers(workers: int) -> None:
-    if workers < 1:
-        raise InvalidInputError(f"--workers {workers}: give at least 1")
-
-
-@contextlib.contextmanager
-def _progress(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on standard error that is set with (done, all)."""
-    with tqdm(desc=description, unit=unit, file=sys.stderr, mininterval=0.5, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show
-
-
-def _mean(estimate: Estimate | None, digits: int = 3, factor: float = 1.0) -> str:
-    return _number(None if estimate is None else estimate.mean, digits, factor)
-
-
-def _number(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
-    return "-" if value is None else f"{factor * value:.{digits}f}"

@@ -8,7 +8,6 @@ score puts them, without a rank, and lead no group.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -113,16 +112,11 @@ def _entry(
     results: dict[str, list[Any]] = {name: [] for name in objects}
     for result in score.results:
         results[result.object].append(result)
+    written = score.to_json()
     return {
+        **{name: written[name] for name in ("submission", "content_hash", "verified", "aggregate", "notes")},
         "rank": position,
         "behind_leader": difference,
-        "submission": score.info.to_json(),
-        "content_hash": score.content_hash,
-        "verified": score.verified,
-        "aggregate": {
-            group_name: {metric: dataclasses.asdict(estimate) for metric, estimate in estimates.items()}
-            for group_name, estimates in score.aggregate.items()
-        },
         "improvement": _improvement(score, group),
         "per_object": {
             name: {
@@ -133,7 +127,6 @@ def _entry(
         },
         "recall_curve": _mean_curve([r.recall_curve for r in score.results]),
         "surface_iou_curve": _mean_curve([r.surface_iou_curve for r in score.results]),
-        "notes": list(score.notes),
     }
 
 

@@ -13,7 +13,7 @@ _COMMANDS = {
     "assets": ("tslam_bench.cli.assets", "main", "prepare, list, show and verify objects and the hand"),
     "baselines": ("tslam_bench.baselines.commands", "main", "list, train and evaluate the registered explorers"),
     "reconstruct": ("tslam_bench.cli.reconstruct", "main", "train and run reconstructors"),
-    "score": ("tslam_bench.leaderboard.commands", "score_main", "score submissions: a table and JSON"),
+    "score": ("tslam_bench.cli.score", "score_main", "score submissions: a table and JSON"),
     "leaderboard": ("tslam_bench.leaderboard.commands", "page_main", "rank scored submissions and build the page"),
     "gpu-check": ("tslam_bench.cli.gpu_check", "main", "compare the GPU simulation with the CPU's"),
     "env": ("tslam_bench.cli.environments", "main", "list environments, describe their spaces, record a video"),

@@ -1,0 +1,117 @@
+"""``tslam-bench score`` on a small run made of primitives."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from scored_run import NAMES, fake_score, info
+
+from tslam_bench.cli import main
+from tslam_bench.cli.score import object_table, score_main, summary_table
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.scoring.scoring import SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.submission import SubmissionWriter
+
+
+@pytest.fixture(autouse=True)
+def use_cache(primitive_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TSLAM_BENCH_CACHE", str(primitive_cache))
+
+
+def test_score_prints_a_table_and_writes_json(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = run / "submissions" / "mine-hull"
+    score_main([str(path), "--objects", *NAMES, "--output", str(tmp_path / "score.json")])
+    printed = capsys.readouterr().out
+    value = json.loads((tmp_path / "score.json").read_text())
+    assert SubmissionScore.from_json(value, "file").objects == NAMES
+    assert value == json.loads((run / "scores" / "mine-hull.json").read_text())
+    for name in NAMES:
+        assert name in printed
+    for group, metric in (("areas", "iou_area"), ("1", "iou"), ("8", "iou"), ("8", "calibration_error")):
+        assert f"{value['aggregate'][group][metric]['mean']:.3f}" in printed
+
+
+def test_score_prints_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    score_main([str(run / "submissions" / "random-grid"), "--objects", "mug", "--json"])
+    assert json.loads(capsys.readouterr().out)["objects"] == ["mug"]
+
+
+@pytest.mark.parametrize(
+    ("object_set", "seeds", "full"), [("test", (0,), False), ("test", (0, 1, 2), True), ("quick", (0,), True)]
+)
+def test_an_entry_of_few_seeds_says_so(object_set, seeds, full: bool, tmp_path: Path, primitive_cache: Path) -> None:
+    with SubmissionWriter(tmp_path / "s", info("mine", "hull", object_set=object_set, seeds=seeds)):
+        pass
+    notes = score_submission(tmp_path / "s", ["mug"], cache=primitive_cache).notes
+    assert any("not a full entry" in note for note in notes) is not full
+    assert any(
+        "missing, counted as empty: rollout of pose 0" in note for note in notes
+    )  # all pieces are, and are named
+    assert any("reconstruction of 1 pose, reconstruction of 2 poses" in note for note in notes)
+
+
+def test_each_score_is_written_as_soon_as_it_is_there(run: Path, tmp_path: Path) -> None:
+    """The second submission is refused; the first one's score is there all the same."""
+    (tmp_path / "broken").mkdir()
+    with pytest.raises(InvalidInputError, match="broken"):
+        paths = [str(run / "submissions" / "random-grid"), str(tmp_path / "broken")]
+        score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
+    assert [p.name for p in (tmp_path / "scores").iterdir()] == ["random-grid.json"]
+
+
+def test_several_scores_go_to_a_folder(run: Path, tmp_path: Path) -> None:
+    paths = [str(run / "submissions" / name) for name in ("random-grid", "mine-hull")]
+    score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
+    assert sorted(p.name for p in (tmp_path / "scores").iterdir()) == ["mine-hull.json", "random-grid.json"]
+
+
+@pytest.mark.slow
+def test_processes_do_not_change_the_score(run: Path, primitive_cache: Path) -> None:
+    path = run / "submissions" / "mine-hull"
+    with worker_pool(2) as pool:
+        assert isinstance(pool, ProcessPoolExecutor)
+        in_processes = [score_submission(path, NAMES, pool, cache=primitive_cache).to_json() for _ in range(2)]
+    assert in_processes == 2 * [score_submission(path, NAMES, cache=primitive_cache).to_json()]
+
+
+def test_same_names_are_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="same name"):
+        path = str(run / "submissions" / "random-grid")
+        score_main([path, path, "--objects", "mug", "--output", str(tmp_path)])
+
+
+def test_names_are_not_read_as_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    """Square brackets mean colours to the library that prints the tables."""
+    score = fake_score("a", [0.25])
+    score = replace(score, info=replace(score.info, method="[red]mine[/] [/nothing]"))
+    for table in (summary_table([score]), object_table(score)):
+        Console(width=200).print(table)
+        assert "[red]mine[/] [/nothing]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "name at least one submission"),
+        (["nothing-here"], "no such folder"),
+        (["SUBMISSION", "--objects", "mugg"], "mugg"),
+        (["SUBMISSION", "--objects", "hammer"], "tslam-bench assets prepare"),
+        (["SUBMISSION", "--objects", "mug", "--workers", "0"], "--workers 0"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    arguments: list[str], message: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    submission = str(run / "submissions" / "mine-hull")
+    with pytest.raises(SystemExit) as caught:
+        main(["score", *(submission if argument == "SUBMISSION" else argument for argument in arguments)])
+    assert caught.value.code == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("tslam-bench:")]
+    assert len(lines) == 1 and message in lines[0]
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,154 @@
+"""``tslam-bench score``: scores of submissions as tables and JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from tqdm import tqdm
+
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import write_json
+from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
+from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
+
+
+@dataclass(frozen=True)
+class ScoreArguments:
+    """Scores submissions against the prepared test objects: a table, and JSON on request."""
+
+    submissions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders or zip archives that hold submission.json."""
+    output: Path | None = None
+    """JSON file for the scores; with several submissions, a folder that gets one file each, as soon as it is scored."""
+    objects: tuple[str, ...] = ()
+    """Objects to score; empty: those of the submission's object set."""
+    workers: int = 1
+    """Processes."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+def score_main(arguments: Sequence[str]) -> None:
+    """Runs ``tslam-bench score``.
+
+    Raises:
+        BenchmarkError: bad input; the message is one line.
+    """
+    parsed = tyro.cli(ScoreArguments, args=list(arguments), prog="tslam-bench score")
+    if not parsed.submissions:
+        raise InvalidInputError("score: name at least one submission, a folder or a zip archive")
+    check_workers(parsed.workers)
+    files = _score_files(parsed.submissions, parsed.output)
+    scores = []
+    with worker_pool(parsed.workers) as pool:
+        for path, file in zip(parsed.submissions, files, strict=True):
+            with progress(f"score {path.name}", "object") as show:
+                scores.append(score_submission(path, parsed.objects or None, pool, show))
+            if file is not None:
+                write_json(file, scores[-1].to_json())
+    if parsed.json:
+        values = [score.to_json() for score in scores]
+        print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
+        return
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=170)  # a file or a pipe has no width
+    console.print(summary_table(scores))
+    for score in scores:
+        if len(scores) == 1:
+            console.print(object_table(score))
+        for note in score.notes:
+            console.print(f"[yellow]note[/] {escape(f'{score.info.method}: {note}')}", highlight=False)
+
+
+def summary_table(scores: Sequence[SubmissionScore]) -> Table:
+    """One row per submission."""
+    table = _table(
+        "Scores: IoU area is the mean of the IoU after 1, 2, 4 and 8 poses; all that names no number is after 8"
+    )
+    table.add_column("method", no_wrap=True)
+    _add_columns(table, IOU_AREA.short, "95 %", *(figure.short for figure in FIGURES))
+    for score in scores:
+        aggregate: dict[str, Any] = score.to_json()["aggregate"]
+        values = means(aggregate)
+        table.add_row(
+            escape(score.info.method + (" (privileged)" if score.info.privileged else "")),
+            IOU_AREA.text(values),
+            interval(aggregate["areas"]["iou_area"]),
+            *(figure.text(values) for figure in FIGURES),
+        )
+    return table
+
+
+def object_table(score: SubmissionScore) -> Table:
+    """One row per object and seed of one submission."""
+    table = _table(f"{escape(score.info.method)}, per object; all that names no number is after 8 poses")
+    table.add_column("object")
+    _add_columns(table, "seed", IOU_AREA.short, *(figure.short for figure in FIGURES))
+    table.add_column("remark")
+    for result in score.results:
+        values = {**result.poses, "areas": result.areas}
+        table.add_row(
+            result.object,
+            str(result.seed),
+            IOU_AREA.text(values),
+            *(figure.text(values) for figure in FIGURES),
+            escape(_remark(result)),
+        )
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+
+
+def _add_columns(table: Table, *names: str) -> None:
+    """Columns of figures; a long head takes two lines."""
+    for name in names:
+        table.add_column(name if len(name) < 6 else name.replace(" ", "\n"), justify="right", no_wrap=name != "95 %")
+
+
+def _remark(result: ObjectScore) -> str:
+    """Why reconstructions count as empty: "8: missing"."""
+    return "; ".join(f"{count}: {reason}" for count, reason in result.reasons.items() if reason is not None)
+
+
+def _score_files(paths: Sequence[Path], output: Path | None) -> list[Path | None]:
+    """Where the score of each submission goes, or None; known before hours of scoring, not after."""
+    if output is None:
+        return [None] * len(paths)
+    if len(paths) == 1:
+        return [output / f"{paths[0].stem}.json" if output.is_dir() else output]
+    names = [path.stem for path in paths]
+    if len(set(names)) != len(names):
+        raise InvalidInputError("score: two submissions have the same name; write them to different folders")
+    return [output / f"{name}.json" for name in names]
+
+
+def check_workers(workers: int) -> None:
+    """Raises InvalidInputError for a number of processes below 1."""
+    if workers < 1:
+        raise InvalidInputError(f"--workers {workers}: give at least 1")
+
+
+@contextlib.contextmanager
+def progress(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on standard error that is set with (done, all)."""
+    with tqdm(desc=description, unit=unit, file=sys.stderr, mininterval=0.5, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show

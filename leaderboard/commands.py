@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sys
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -15,8 +13,8 @@ import tyro
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
+from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
@@ -86,8 +84,8 @@ def score_main(arguments: Sequence[str]) -> None:
     scores = []
     with worker_pool(parsed.workers) as pool:
         for path, file in zip(parsed.submissions, files, strict=True):
-            with _progress(f"score {path.name}", "object") as show:
-                scores.append(score_submission(path, parsed.objects or None, pool, show))
+            with Progress(f"score {path.name}", "object", leave=False) as bar:
+                scores.append(score_submission(path, parsed.objects or None, pool, bar.show))
             if file is not None:
                 write_json(file, scores[-1].to_json())
     if parsed.json:
@@ -129,9 +127,9 @@ def page_main(arguments: Sequence[str]) -> None:
     leaderboard = rank(scores)
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
-    with _progress("pictures", "picture") as show:
+    with Progress("pictures", "picture", leave=False) as bar:
         drawn = make_pictures(
-            list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, show
+            list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, bar.show
         )
     images = {key: drawn[picture] for key, picture in pictures.items() if picture in drawn}
     html = build_page(leaderboard, images)
@@ -265,8 +263,8 @@ def _score_missing(
     missing = [path for key, (path, _) in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for path in missing:
-            with _progress(f"score {path.name}", "object") as show:
-                current.append(score_submission(path, None, pool, show))
+            with Progress(f"score {path.name}", "object", leave=False) as bar:
+                current.append(score_submission(path, None, pool, bar.show))
     return current
 
 
@@ -308,18 +306,6 @@ def _score_files(paths: Sequence[Path], output: Path | None) -> list[Path | None
 def _check_workers(workers: int) -> None:
     if workers < 1:
         raise InvalidInputError(f"--workers {workers}: give at least 1")
-
-
-@contextlib.contextmanager
-def _progress(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on standard error that is set with (done, all)."""
-    with tqdm(desc=description, unit=unit, file=sys.stderr, mininterval=0.5, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show
 
 
 def _mean(estimate: Estimate | None, digits: int = 3, factor: float = 1.0) -> str:

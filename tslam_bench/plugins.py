@@ -133,7 +133,7 @@ class Registry(Generic[S]):
             raise InvalidInputError(f"{label}: returned the class {made.__name__}, expected an instance; call it")
         for method in methods:
             if not callable(getattr(made, method, None)):
-                raise InvalidInputError(f"{label}: {type(made).__name__} has no method {method}; see docs/your-own.md")
+                raise InvalidInputError(f"{label}: {type(made).__name__} has no method {method}; see help(tslam_bench.register_{self.kind})")
         return made
 
     def label(self, spec: S) -> str:

@@ -54,7 +54,7 @@ def test_help_describes_every_flag(capsys, words: tuple[str, ...]) -> None:
     assert flags
     for flag in flags:
         described = re.sub(r"\(default:.*|\(required\)", "", flag, flags=re.DOTALL).split("  ", 1)[-1]
-        assert len(described.split()) >= 2, flag
+        assert described.strip(), flag
 
 
 def test_help_needs_neither_simulator_nor_torch_nor_settings() -> None:

@@ -77,8 +77,7 @@ class Registry(Generic[S]):
         Raises:
             InvalidInputError: the id is not an identifier, or is one of the benchmark's own.
         """
-        if not IDENTIFIER.fullmatch(spec.id):
-            raise InvalidInputError(f"{self.kind} {spec.id!r}: use at most 64 of a-z, 0-9, '_', '.', '-' as its id")
+        self._check_id(spec.id)
         if spec.id in self._built_in:
             raise InvalidInputError(f"{self.kind} {spec.id!r}: is the benchmark's own; choose another id")
         self._registered[spec.id] = spec
@@ -91,7 +90,7 @@ class Registry(Generic[S]):
         """The spec of an id, of ``module:name``, of a class or function, or of a policy or reconstructor that is already made.
 
         Raises:
-            InvalidInputError: unknown id (the message lists the known ones).
+            InvalidInputError: unknown id (the message lists the known ones), or an entry point that cannot be one.
         """
         if not isinstance(wanted, str):
             ready = not (isinstance(wanted, type | partial) or inspect.isroutine(wanted))
@@ -107,6 +106,7 @@ class Registry(Generic[S]):
         if known is None:
             ids = ", ".join(self._ids())
             raise InvalidInputError(f"{self.kind} {wanted!r}: unknown; choose one of {ids}, or give module:Class")
+        self._check_id(known.id)
         return known
 
     def make(self, spec: S, arguments: Mapping[str, Any], methods: Sequence[str]) -> Any:
@@ -133,7 +133,8 @@ class Registry(Generic[S]):
             raise InvalidInputError(f"{label}: returned the class {made.__name__}, expected an instance; call it")
         for method in methods:
             if not callable(getattr(made, method, None)):
-                raise InvalidInputError(f"{label}: {type(made).__name__} has no method {method}; see help(tslam_bench.register_{self.kind})")
+                remedy = f"see help(tslam_bench.register_{self.kind})"
+                raise InvalidInputError(f"{label}: {type(made).__name__} has no method {method}; {remedy}")
         return made
 
     def label(self, spec: S) -> str:
@@ -170,6 +171,10 @@ class Registry(Generic[S]):
         """Specs that installed packages name as entry points."""
         found = importlib.metadata.entry_points(group=self._group)
         return {e.name: self._own(id=e.name, summary=f"entry point {e.value}", factory=e.value) for e in found}
+
+    def _check_id(self, identifier: str) -> None:
+        if not IDENTIFIER.fullmatch(identifier):
+            raise InvalidInputError(f"{self.kind} {identifier!r}: use at most 64 of a-z, 0-9, '_', '.', '-' as its id")
 
     def _ids(self) -> list[str]:
         return list(dict.fromkeys([*self._built_in, *self._registered, *sorted(self._installed())]))

@@ -344,6 +344,7 @@ def test_a_mistake_is_one_line(wrong: Path, capsys, policy: str, message: str) -
         (("--policy", "random", "--policy-arguments", "size=3"), "unexpected keyword argument 'size'"),
         (("--policy", "wrong:Good", "--policy-arguments", "size"), "argument 'size': give key=value"),
         (("--policy", "wrong:Good", "--policy-arguments", "{size"), "not a JSON object"),
+        (("--policy", "wrong:Good", "--policy-arguments", "model=m.pt"), "give it as the model"),
         (("--policy", "oracle", "--policy-arguments", "size=3"), "a reference takes no arguments"),
         (("--policy", "heuristic", "--reconstructor", "wrong:NoAct"), "NoAct has no method reconstruct"),
         (("--policy", "heuristic", "--reconstructor", "wrong:Good=m.pt"), "takes no model; leave m.pt out"),
@@ -469,6 +470,7 @@ def test_installed_packages_name_theirs_as_entry_points(tmp_path: Path, monkeypa
             [tslam_bench.policies]
             still = elsewhere:Good
             random = elsewhere:NoAct
+            Not_An_Id = elsewhere:Good
             [tslam_bench.reconstructors]
             wrongly = elsewhere:Good
         """)
@@ -479,6 +481,8 @@ def test_installed_packages_name_theirs_as_entry_points(tmp_path: Path, monkeypa
     assert get_baseline("still").summary == "entry point elsewhere:Good" and get_reconstructor("wrongly").needs == "own"
     assert type(make_baseline("still")).__module__ == "elsewhere"
     assert type(make_baseline("random")).__name__ == "RandomBaseline", "a built-in id stays what it is"
+    with pytest.raises(InvalidInputError, match="'Not_An_Id': use at most 64"):
+        get_baseline("Not_An_Id")
     cli.main(["baselines", "list", "--json"])
     assert json.loads(capsys.readouterr().out)[-1]["id"] == "still"
 

@@ -32,7 +32,8 @@ def evaluate(
 
     Args:
         policy: an id, ``module:Class``, ``path/to/file.py:Class``, a class or function, or a policy
-            (:class:`tslam_bench.evaluation.policy.Policy`).
+            (:class:`tslam_bench.evaluation.policy.Policy`). Of one that is already made only the class is recorded: give a class
+            and ``arguments``, or another ``output`` for other settings.
         reconstructors: each an id, ``ID=MODEL``, ``module:name`` or ``module:name=MODEL``, a class or function, or a
             reconstructor; ``("none",)`` only explores.
         objects: objects of the test split; empty: those of the object set.

@@ -96,6 +96,8 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "spec", get_baseline(self.policy))
+        if "model" in self.arguments:
+            raise InvalidInputError("argument 'model': give it as the model, so that its content is recorded")
         if self.spec.kind == "reference" and (self.arguments or self.model):
             raise InvalidInputError(f"policy {self.spec.id!r}: a reference takes no arguments and no model")
         if self.policy_salt is not None:

@@ -117,7 +117,7 @@ def get_baseline(policy: Any) -> PolicySpec:
     return _POLICIES.get(policy)
 
 
-def make_baseline(policy: Any, model: Path | None = None, **arguments: Any) -> Policy:
+def make_baseline(policy: Any, model: Path | None = None, /, **arguments: Any) -> Policy:
     """Builds a policy.
 
     Args:

@@ -60,10 +60,11 @@ def evaluate(
         AssetError: an object is not prepared, or ``output`` cannot be written.
     """
     from tslam_bench.evaluation import evaluate as evaluation
+    from tslam_bench.objects.splits import object_set as objects_of
 
     config = evaluation.EvaluationConfig(
         policy=policy,
-        objects=tuple(objects) or evaluation.default_objects(object_set),
+        objects=tuple(objects) or objects_of(object_set),
         seeds=tuple(seeds),
         object_set=object_set,
         model=None if model is None else Path(model),

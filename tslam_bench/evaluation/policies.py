@@ -59,7 +59,7 @@ _POLICIES: Final = Registry(
     "policy",
     "tslam_bench.policies",
     (
-        _scripted("random", "tslam_bench.baselines.random_actions:RandomBaseline", "uniform actions each step"),
+        _scripted("random", "tslam_bench.baselines.random_actions:RandomBaseline", "uniform actions in each step"),
         _scripted(
             "random_targets",
             "tslam_bench.baselines.random_actions:RandomTargetsBaseline",
@@ -78,8 +78,8 @@ _POLICIES: Final = Registry(
         _learned("tslam_contact", "contact", "PPO on being in contact, plus coverage"),
         _learned("tslam_disagreement", "disagreement", "PPO on the change of the contacts' alpha shape, plus coverage"),
         _learned("tslam_chamfer", "chamfer", "PPO on the Chamfer distance to the true surface, plus coverage"),
-        _reference("oracle", "reference: every surface voxel touched"),
-        _reference("nothing", "reference: nothing touched"),
+        _reference("oracle", "every surface voxel touched"),
+        _reference("nothing", "nothing touched"),
     ),
     PolicySpec,
 )

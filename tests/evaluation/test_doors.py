@@ -219,7 +219,9 @@ def test_reconstructions_of_changed_code_are_not_mixed(evaluated: Path, tmp_path
     tslam_bench.evaluate(*arguments)
     tslam_bench.evaluate(*arguments)
     (tmp_path / "box.py").write_text(MODULE + "\n# changed\n")
-    with pytest.raises(InvalidInputError, match=r"oracle-box.make: holds other results \(another code_sha256\)"):
+    with pytest.raises(
+        InvalidInputError, match=r"oracle-box.make: holds other reconstructions \(another code_sha256\)"
+    ):
         tslam_bench.evaluate(*arguments)
 
 

@@ -316,7 +316,7 @@ def test_episodes_of_other_assets_are_not_mixed(tmp_path: Path) -> None:
     folder = tmp_path / "rollouts" / "random"
     folder.mkdir(parents=True)
     (folder / "source.json").write_text(json.dumps({"policy": "random", "asset_manifest_sha256": "another"}))
-    with pytest.raises(InvalidInputError, match=r"holds other results \(another .*asset_manifest_sha256"):
+    with pytest.raises(InvalidInputError, match=r"holds other episodes \(another .*asset_manifest_sha256"):
         evaluate(config, {}, tmp_path)
 
 

@@ -179,7 +179,7 @@ def evaluate(
     for name, reconstructor in reconstructors.items():
         submission = output / "submissions" / f"{spec.id}-{name}"
         record = output / "reconstructors" / f"{submission.name}.json"
-        _record_source(record, reconstructor.source, submission, submission.is_dir())
+        _record_source(record, reconstructor.source, f"{submission}: holds other reconstructions", submission.is_dir())
         with SubmissionWriter(submission, submission_info(config, name, source)) as writer:
             total = len(config.objects) * len(config.seeds)
             for done, (object_name, seed) in enumerate(_repetitions(config)):
@@ -204,7 +204,7 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     salt = config.policy_salt or known.get("policy_salt") or new_salt()
     source = _source(config, baseline.control_mode, salt)
-    _record_source(path, source, folder, bool(known))
+    _record_source(path, source, f"{folder}: holds other episodes", bool(known))
     episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
     missing = [e for e in shuffled(salt, episodes) if not episode_path(folder, *e).is_file()]
     report("explore", len(episodes) - len(missing), len(episodes))
@@ -348,12 +348,12 @@ def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str,
     }
 
 
-def _record_source(path: Path, source: Mapping[str, Any], results: Path, resumed: bool) -> None:
-    """Writes what ``results`` depend on, or raises InvalidInputError if those that are resumed depend on something else."""
+def _record_source(path: Path, source: Mapping[str, Any], others: str, resumed: bool) -> None:
+    """Writes what results depend on, or raises InvalidInputError (``others``) if those resumed depend on something else."""
     known = json.loads(path.read_text(encoding="utf-8")) if resumed and path.is_file() else source
     if known != source:
         differing = ", ".join(key for key in source if known.get(key) != source[key])
-        raise InvalidInputError(f"{results}: holds other results (another {differing}); delete it or move it away")
+        raise InvalidInputError(f"{others} (another {differing}); delete it or move it away")
     write_json(path, source)
 
 

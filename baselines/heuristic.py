@@ -111,7 +111,7 @@ class HeuristicBaseline:
         self.reset(1, 0)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         c = self.config
         generators = episode_generators(num_envs, seed)
         unit = np.stack([generator.uniform(-1, 1, (c.spots, 7)) for generator in generators])
@@ -131,7 +131,7 @@ class HeuristicBaseline:
         self._last_height = np.full(num_envs, np.inf)
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         c = self.config
         qpos = np.asarray(check_observation(observation, len(self._phase)), dtype=np.float64)
         self._advance(qpos, np.any(np.asarray(observation["touch"])[:, _PALM], axis=1))

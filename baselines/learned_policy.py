@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policies import BaselineSpec
 from tslam_bench.evaluation.policy import check_observation, episode_generators
 from tslam_bench.hand_constants import CONTROL_MODES
 
@@ -43,37 +42,13 @@ class LearnedBaseline:
         self._generators: list[np.random.Generator] = []
         self._step = 0
 
-    @classmethod
-    def load(cls, spec: BaselineSpec, directory: Path | None, deterministic: bool = False) -> LearnedBaseline:
-        """Loads the model that ``tslam-bench baselines train`` wrote to ``directory``.
-
-        Raises:
-            InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
-        """
-        command = f"tslam-bench baselines train {spec.id} --output {directory or 'DIRECTORY'}"
-        if directory is None:
-            raise InvalidInputError(
-                f"baseline {spec.id!r}: needs a trained model; pass its directory, or train one: {command}"
-            )
-        try:
-            network, metadata = read_model(directory)
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{error}; train it: {command}") from error
-        config = metadata["config"]
-        mode, repeat = config.get("control_mode"), config.get("action_repeat")
-        if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
-            raise InvalidInputError(
-                f"{directory}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
-            )
-        return cls(network, mode, repeat, deterministic)
-
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         self._generators = episode_generators(num_envs, seed)
         self._step = 0
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         check_observation(observation, len(self._generators))
         if self._step % self._repeat == 0:
             self._held = self._decide(observation)
@@ -95,3 +70,32 @@ class LearnedBaseline:
             noise = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
             actions = actions + self._deviation * np.stack(noise)
         return np.clip(actions, -1, 1)
+
+
+def load_policy(baseline: str, model: Path | None = None, deterministic: bool = False) -> LearnedBaseline:
+    """The policy of a learned baseline.
+
+    Args:
+        baseline: id, for messages.
+        model: directory that ``tslam-bench baselines train`` wrote.
+        deterministic: act by the mean.
+
+    Raises:
+        InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
+    """
+    command = f"tslam-bench baselines train {baseline} --output {model or 'DIRECTORY'}"
+    if model is None:
+        raise InvalidInputError(
+            f"policy {baseline!r}: needs a trained model; pass its directory, or train one: {command}"
+        )
+    try:
+        network, metadata = read_model(model)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{error}; train it: {command}") from error
+    config = metadata["config"]
+    mode, repeat = config.get("control_mode"), config.get("action_repeat")
+    if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
+        raise InvalidInputError(
+            f"{model}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
+        )
+    return LearnedBaseline(network, mode, repeat, deterministic)

@@ -37,12 +37,12 @@ class _DrawnBaseline(ABC):
         """One horizon's actions in [-1, 1] of one episode."""
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         self._generators = episode_generators(num_envs, seed)
         self._draw()
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
-        """See :class:`tslam_bench.evaluation.policy.Baseline`."""
+        """See :class:`tslam_bench.evaluation.policy.Policy`."""
         check_observation(observation, len(self._generators))
         if self._step == HORIZON:
             self._draw()

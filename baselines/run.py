@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Final, Literal
 
 import tyro
-from tqdm import tqdm
 
+from tslam_bench.cli.ending import one_line_errors
+from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
 from tslam_bench.episodes import check_salt
-from tslam_bench.errors import BenchmarkError, InvalidInputError
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.jobs import Job, JobRunner
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline, list_baselines
 from tslam_bench.objects.splits import known_names
@@ -46,7 +47,7 @@ class RunSettings:
         name: folder below the output folder, and label.
         objects: test objects; empty: the whole test split.
         object_set: ranking that the submissions are for.
-        baselines: explorers.
+        baselines: policies: ids, or ``module:Class``.
         seeds: repetitions of every episode.
         steps: training steps of each learned baseline.
         training: further arguments of ``tslam-bench baselines train``.
@@ -160,13 +161,13 @@ class Arguments:
     objects: tuple[str, ...] | None = None
     """Test objects instead of the preset's."""
     baselines: tuple[str, ...] | None = None
-    """Explorers instead of the preset's (tslam-bench baselines list)."""
+    """Policies instead of the preset's: ids (tslam-bench baselines list), module:Class or file.py:Class."""
     seeds: tuple[int, ...] | None = None
     """Repetitions of every episode instead of the preset's."""
     steps: int | None = None
     """Training steps of each learned baseline instead of the preset's."""
     reconstructors: tuple[str, ...] | None = None
-    """Reconstructors instead of the preset's (tslam-bench reconstruct list)."""
+    """Reconstructors instead of the preset's: ids (tslam-bench reconstruct list), module:Class or file.py:Class."""
     policy_salt: str | None = None
     """Hexadecimal digits that explorers' random numbers come from, instead of the preset's."""
     output: Path | None = None
@@ -301,24 +302,24 @@ def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
     models = _models(settings, output)
     jobs = []
     for name in settings.baselines:
-        kind = get_baseline(name).kind
+        spec = get_baseline(name)
         chosen = _reconstructors(settings, name)
         specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
-        command: Command = ("tslam-bench", "baselines", "evaluate", name, "--object-set", settings.object_set)
+        command: Command = ("tslam-bench", "evaluate", "--policy", name, "--object-set", settings.object_set)
         command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
-        if kind != "reference":
+        if spec.kind != "reference":
             command += ("--policy-salt", settings.policy_salt)
-        command += ("--reconstructors", *specifications, *_ONE_PROCESS, "--output", str(output))
+        command += ("--reconstructor", *specifications, *_ONE_PROCESS, "--output", str(output))
         after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
         if any(get_reconstructor(r).needs == "objects" for r in chosen):
             after.append("assets-train")
             command += _listed("--learning-objects", dict(settings.learning_objects)["train"])
-        if kind == "learned":
+        if spec.kind == "learned":
             label = f"{settings.name}: {settings.steps:,} steps" + (f", {settings.remark}" if settings.remark else "")
             command += ("--model", str(output / "models" / name), "--label", label)
             after.append(f"train-{name}")
-        outputs = tuple(output / "submissions" / f"{name}-{r}" / INFO_FILE for r in chosen)
-        jobs.append(Job(f"evaluate-{name}", command, tuple(after), outputs))
+        outputs = tuple(output / "submissions" / f"{spec.id}-{get_reconstructor(r).id}" / INFO_FILE for r in chosen)
+        jobs.append(Job(f"evaluate-{spec.id}", command, tuple(after), outputs))
     return jobs
 
 
@@ -341,16 +342,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs ``python -m tslam_bench.baselines.run``; exits with 0, 2 (bad input, a failed job) or 130 (interrupted)."""
     parsed = tyro.cli(Arguments, args=arguments, prog="bash baselines/run_all.sh")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends jobs in order, as Ctrl-C does
-    try:
+    with one_line_errors("run"):
         settings = settings_of(parsed)
         output = parsed.output or Path("runs") / settings.name
         _run(plan(settings, output, parsed.workers), output, parsed.workers, parsed.dry_run)
-    except BenchmarkError as error:
-        print(f"run: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("run: interrupted; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
 
 
 def _run(jobs: list[Job], output: Path, workers: int, dry_run: bool) -> None:
@@ -360,17 +355,9 @@ def _run(jobs: list[Job], output: Path, workers: int, dry_run: bool) -> None:
         print("\n".join(shlex.join(job.command) for job in jobs))
         return
     started = time.monotonic()
-    interactive = sys.stderr.isatty()
-    with tqdm(
-        total=len(jobs), unit="job", disable=not interactive, bar_format="{l_bar}{bar}| {elapsed} {postfix}"
-    ) as bar:
-
-        def show(done: int, total: int, running: str) -> None:
-            bar.set_postfix_str(running, refresh=False)
-            bar.update(done - bar.n)
-            bar.refresh()
-
-        JobRunner(output, workers, lambda line: bar.write(line), show).run(jobs)
+    form = "{l_bar}{bar}| {elapsed} {postfix}"
+    with Progress("run", "job", len(jobs), disable=not sys.stderr.isatty(), bar_format=form, mininterval=0) as bar:
+        JobRunner(output, workers, bar.write, bar.show).run(jobs)
     print(f"run: done in {(time.monotonic() - started) / 60:.1f} minutes: {output / 'index.html'}")
 
 

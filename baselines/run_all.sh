@@ -17,11 +17,11 @@ runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run i
   --full                 the whole test split, three seeds, the paper's training budget: days on a CPU
 
   --objects NAME ...     test objects instead of the preset's
-  --baselines ID ...     explorers instead of the preset's (tslam-bench baselines list)
+  --baselines ID ...     policies instead of the preset's (tslam-bench baselines list), or installed module:Class
   --seeds N ...          repetitions of every episode
   --steps N              training steps of each learned baseline
   --reconstructors ID ...
-                         reconstructors instead of the preset's (tslam-bench reconstruct list)
+                         reconstructors instead of the preset's (tslam-bench reconstruct list), or the like
   --policy-salt DIGITS   hexadecimal digits that explorers' random numbers come from
   --output FOLDER        folder of the run (default: runs/ and the preset's name)
   --workers N            processes at a time (default: the cores)

@@ -10,15 +10,14 @@ the worst axis, and the number of points inside the object, as the table of docs
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.constants import WORKSPACE_EDGE
-from tslam_bench.errors import BenchmarkError
 from tslam_bench.geometry.distance import InsideTest
 from tslam_bench.geometry.meshes import TriangleMesh
 from tslam_bench.geometry.sampling import iou_points
@@ -78,7 +77,7 @@ def deviations(item: PreparedObject, sets: int) -> tuple[NDArray, NDArray]:
 def main() -> None:
     """Command line."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    try:
+    with one_line_errors("iou_precision"):
         names = arguments.objects or known_names(arguments.split)
         worst = []
         print("| object | inside, before | sd, before | inside, after | sd, after |\n|---|---|---|---|---|")
@@ -87,9 +86,6 @@ def main() -> None:
             before, after = deviation.max(axis=1)
             worst.append((before, after))
             print(f"| {name} | {inside[0]:,.0f} | {before:.4f} | {inside[1]:,.0f} | {after:.4f} |", flush=True)
-    except BenchmarkError as error:
-        print(f"iou_precision: {error}", file=sys.stderr)
-        sys.exit(2)
     figures = np.array(worst)
     for kind, column in zip(("before", "after"), figures.T, strict=True):
         print(f"{kind}: {column.min():.4f} to {column.max():.4f}, median {np.median(column):.4f}")

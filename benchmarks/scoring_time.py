@@ -10,7 +10,6 @@ first object warms up and is left out.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from report import machine, markdown_table
 from scipy.ndimage import gaussian_filter
 
 from tslam_bench import grids
-from tslam_bench.errors import BenchmarkError
+from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
@@ -114,11 +113,8 @@ class Stages:
 def main() -> None:
     """Command line."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    try:
+    with one_line_errors("scoring_time"):
         items = [load_object(name) for name in arguments.objects]
-    except BenchmarkError as error:
-        print(f"scoring_time: {error}", file=sys.stderr)
-        sys.exit(2)
     print(machine())
     stages = Stages()
     stages.time(Submission, "rollout", "reading rollouts")

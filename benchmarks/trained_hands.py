@@ -25,7 +25,7 @@ from tslam_bench.constants import NUM_POSES
 from tslam_bench.engine.hand_batch import BatchSettings
 from tslam_bench.engine.spaces import OBSERVATION_ARRAYS
 from tslam_bench.evaluation.policies import make_baseline
-from tslam_bench.evaluation.policy import Baseline
+from tslam_bench.evaluation.policy import Policy
 
 TWELVE_OBJECTS = (
     *("mug-000", "bowl-000", "goblet-000", "frying-pan-000", "mallet-000", "teapot-000", "plate-000", "spoon-000"),
@@ -48,7 +48,7 @@ class Config:
     """Page whose section ``trained`` is replaced by the table."""
 
 
-def depths_of(explorer: Baseline, objects: Sequence[str], poses: int) -> tuple[NDArray[np.float64], float]:
+def depths_of(explorer: Policy, objects: Sequence[str], poses: int) -> tuple[NDArray[np.float64], float]:
     """Depth (m) of every contact step, and touched voxels per episode."""
     names = list(objects)
     settings = BatchSettings(
@@ -78,7 +78,7 @@ def depths_of(explorer: Baseline, objects: Sequence[str], poses: int) -> tuple[N
 
 def main(config: Config) -> None:
     """Prints one row per explorer."""
-    tried: list[tuple[str, Callable[[], Baseline]]] = [
+    tried: list[tuple[str, Callable[[], Policy]]] = [
         (f"`{name}`", lambda name=name: make_baseline(name)) for name in ("random_targets", "heuristic")
     ]
     tried += [(f"trained, {path.name}", lambda path=path: make_baseline("tslam", path)) for path in config.models]

@@ -8,7 +8,6 @@ python docs/build_results.py [--check]                     # write (or compare) 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,8 @@ import numpy as np
 import tyro
 from sections import filled, write_or_check
 
-from tslam_bench.errors import BenchmarkError, InvalidInputError
+from tslam_bench.cli.ending import one_line_errors
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import write_json
 from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, MISSING, Figure, interval, means, number
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
@@ -137,14 +137,11 @@ def texts_of(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
 
 def main(config: Config) -> None:
     """Keeps figures, writes or compares pages."""
-    try:
+    with one_line_errors("build_results"):
         if config.run is not None:
             write_json(KEPT, kept_figures(config.run))
         kept = json.loads(KEPT.read_text(encoding="utf-8"))
         write_or_check({page: filled(page, texts) for page, texts in texts_of(kept).items()}, config.check)
-    except BenchmarkError as error:
-        print(f"build_results: {error}", file=sys.stderr)
-        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ python docs/measure_reconstruction.py rollouts --folder runs/quick/rollouts --sp
 from __future__ import annotations
 
 import itertools
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +17,7 @@ import tyro
 from numpy.typing import NDArray
 
 from tslam_bench import grids
+from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.constants import (
     GRID_SIZE,
     OCCUPANCY_THRESHOLD,
@@ -26,7 +26,6 @@ from tslam_bench.constants import (
     VOXEL_EDGE,
     WORKSPACE_LOW,
 )
-from tslam_bench.errors import BenchmarkError
 from tslam_bench.geometry.sampling import iou_points
 from tslam_bench.objects.splits import prepared_names
 from tslam_bench.objects.store import PreparedObject, load_object
@@ -166,11 +165,8 @@ def rollouts(command: Rollouts) -> None:
 def main() -> None:
     """Command line."""
     command = tyro.cli(Command, description=__doc__)
-    try:
+    with one_line_errors("measure_reconstruction"):
         run(command)
-    except BenchmarkError as error:
-        print(f"measure_reconstruction: {error}", file=sys.stderr)
-        sys.exit(2)
 
 
 def run(command: Hull | Simulated | Rollouts) -> None:

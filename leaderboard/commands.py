@@ -11,7 +11,8 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from tslam_bench.cli.score import check_workers, progress
+from tslam_bench.cli.progress import Progress
+from tslam_bench.cli.score import check_workers
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
@@ -73,9 +74,9 @@ def page_main(arguments: Sequence[str]) -> None:
     leaderboard = rank(scores)
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
-    with progress("pictures", "picture") as show:
+    with Progress("pictures", "picture", leave=False) as bar:
         drawn = make_pictures(
-            list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, show
+            list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, bar.show
         )
     images = {key: drawn[picture] for key, picture in pictures.items() if picture in drawn}
     html = build_page(leaderboard, images)
@@ -151,8 +152,8 @@ def _score_missing(
     missing = [path for key, (path, _) in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for path in missing:
-            with progress(f"score {path.name}", "object") as show:
-                current.append(score_submission(path, None, pool, show))
+            with Progress(f"score {path.name}", "object", leave=False) as bar:
+                current.append(score_submission(path, None, pool, bar.show))
     return current
 
 

@@ -9,7 +9,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEAVES = ("tasks", "baselines", "leaderboard")
-BASE = ("constants", "errors", "files", "grids", "hand_constants", "machine", "episodes", "variants", "version")
+ENTRY_POINT_GROUPS = ("tslam_bench.policies", "tslam_bench.reconstructors")
+BASE = (
+    *("constants", "errors", "files", "grids", "hand_constants"),
+    *("machine", "episodes", "plugins", "variants", "version"),
+)
 """Modules of the library that lie in no folder and that everything may import."""
 ALLOWED: dict[str, set[str]] = {
     "base": set(),
@@ -123,7 +127,7 @@ def test_strings_that_name_modules_name_real_ones() -> None:
     named = set()
     for path in MODULES.values():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value not in ENTRY_POINT_GROUPS:
                 text = node.value.partition(":")[0]
                 if text.startswith("tslam_bench.") and text.replace(".", "").replace("_", "").isalnum():
                     named.add(text)

@@ -89,8 +89,8 @@ def score_hash(folder: Path, reconstructor: str) -> str:
     command = [sys.executable, "-m", "tslam_bench.cli"]
     name = f"heuristic-{reconstructor}"
     if not (folder / "submissions" / name).is_dir():
-        options = ["--objects", "mug", "--reconstructors", "grid", "hull", "carve", "--policy-salt", "2021"]
-        subprocess.run([*command, "baselines", "evaluate", "heuristic", *options, "--output", folder], check=True)
+        options = ["--objects", "mug", "--reconstructor", "grid", "hull", "carve", "--policy-salt", "2021"]
+        subprocess.run([*command, "evaluate", "--policy", "heuristic", *options, "--output", folder], check=True)
     output = folder / f"{name}.json"
     subprocess.run(
         [*command, "score", folder / "submissions" / name, "--objects", "mug", "--output", output], check=True

@@ -128,3 +128,5 @@ REWARD_MODES: Final = (
 )
 PRIVILEGED_REWARD_MODES: Final = ("chamfer",)
 """Reward modes that read the true surface."""
+PRIVILEGED_EXPLORERS: Final = ("tslam_chamfer", "oracle", "nothing")
+"""Explorers of the benchmark that hold no rank: rewarded with the true surface, or references that do not explore."""

@@ -11,3 +11,7 @@ class InvalidInputError(BenchmarkError, ValueError):
 
 class AssetError(BenchmarkError, RuntimeError):
     """Asset data is missing, corrupt, or cannot be fetched or written."""
+
+
+class UserCodeError(BenchmarkError, RuntimeError):
+    """A policy or reconstructor of the user's own raised something, which is the cause of this error."""

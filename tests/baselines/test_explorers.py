@@ -21,7 +21,7 @@ from tslam_bench.baselines.random_actions import RandomBaseline, RandomTargetsBa
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, get_baseline, list_baselines, make_baseline
-from tslam_bench.evaluation.policy import Baseline, episode_generators
+from tslam_bench.evaluation.policy import Policy, episode_generators
 from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH
 
 
@@ -52,7 +52,7 @@ def policy() -> PolicyNetwork:
     return make_network("fast", seed=3)
 
 
-def make(kind: str, policy) -> Baseline:
+def make(kind: str, policy) -> Policy:
     makers = {
         "random": RandomBaseline,
         "random_targets": RandomTargetsBaseline,
@@ -64,7 +64,7 @@ def make(kind: str, policy) -> Baseline:
     return makers[kind]()
 
 
-def moving_hand(baseline: Baseline, seeds: list[int], steps: int, floor: float = -1.0) -> list[np.ndarray]:
+def moving_hand(baseline: Policy, seeds: list[int], steps: int, floor: float = -1.0) -> list[np.ndarray]:
     """Actions on a hand that does what it is told, but cannot sink below ``floor``: (steps,) of (n, 28)."""
     baseline.reset(len(seeds), seeds)
     qpos, actions = start(len(seeds)), []

@@ -104,6 +104,15 @@ def test_flags_change_the_preset(tmp_path: Path) -> None:
     assert "--objects hammer" in jobs["assets-test"] and "--seeds 3 4" in jobs["evaluate-tslam_knn"]
 
 
+def test_policies_and_reconstructors_of_the_users_own_can_be_run(tmp_path: Path) -> None:
+    arguments = Arguments(tiny=True, baselines=("mypkg:MyPolicy",), reconstructors=("grid", "mypkg:make"))
+    jobs = {job.name: job for job in plan(settings_of(arguments), tmp_path, 1)}
+    job = jobs["evaluate-mypkg.mypolicy"]
+    assert "--policy mypkg:MyPolicy" in shlex.join(job.command) and "grid mypkg:make" in shlex.join(job.command)
+    assert [path.parent.name for path in job.outputs] == ["mypkg.mypolicy-grid", "mypkg.mypolicy-mypkg.make"]
+    assert not any(name.startswith("train") for name in jobs)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

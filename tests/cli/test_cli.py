@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from tslam_bench import __version__
+from tslam_bench import __version__, cli
 from tslam_bench.cli import main
 
-COMMANDS = ("assets", "baselines", "reconstruct", "score", "leaderboard", "env")
+COMMANDS = tuple(cli._COMMANDS)
 
 
 def run(capsys: pytest.CaptureFixture, *arguments: str) -> tuple[int, str, str]:
@@ -32,6 +34,50 @@ def test_help_names_every_command_and_each_has_help(capsys):
         assert status == 0 and "usage" in (out + err).lower(), command
 
 
+def leaves() -> list[tuple[str, ...]]:
+    """Every command that has flags."""
+    found: list[tuple[str, ...]] = []
+    for command in COMMANDS:
+        shown = subprocess.run(
+            [sys.executable, "-m", "tslam_bench.cli", command, "--help"], capture_output=True, text=True, check=True
+        )
+        words = re.findall(r"^  ([a-z-]+)  ", shown.stdout.partition("commands:")[2], re.MULTILINE)
+        found += [(command, word) for word in words] or [(command,)]
+    return found
+
+
+@pytest.mark.parametrize("words", leaves(), ids=" ".join)
+def test_help_describes_every_flag(capsys, words: tuple[str, ...]) -> None:
+    status, text, _ = run(capsys, *words, "--help")
+    assert status == 0
+    flags = re.split(r"^[ |]+(?=--[a-z]|-h)", re.sub(r"[│╭╮╰╯─|]|--+(?![a-z])", " ", text), flags=re.MULTILINE)[1:]
+    assert flags
+    for flag in flags:
+        described = re.sub(r"\(default:.*|\(required\)", "", flag, flags=re.DOTALL).split("  ", 1)[-1]
+        assert described.strip(), flag
+
+
+def test_help_needs_neither_simulator_nor_torch_nor_settings() -> None:
+    code = (
+        "import sys\nfrom tslam_bench.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit: pass\n"
+        "assert not {'torch', 'sapien', 'tyro', 'trimesh', 'scipy', 'numba', 'tslam_bench.scoring.scoring'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_errors_become_exit_statuses_in_one_place() -> None:
+    """Elsewhere errors are caught to go on, not to end the program."""
+    root = Path(__file__).parents[2]
+    folders = ("tslam_bench", "baselines", "leaderboard", "tasks", "benchmarks", "docs", "examples")
+    sources = [p for folder in folders for p in (root / folder).rglob("*.py")]
+    ending = [
+        p.name
+        for p in sources
+        if re.search(r"except BenchmarkError[^\n]*\n(?:[^\n]*\n)?[^\n]*sys\.exit", p.read_text())
+    ]
+    assert ending == ["ending.py"]
+
+
 def test_version():
     command = [sys.executable, "-m", "tslam_bench.cli", "--version"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == __version__
@@ -40,7 +86,8 @@ def test_version():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("fly",), "unknown command 'fly'; choose one of assets"),
+        (("fly",), "'fly': unknown command; choose one of assets, env"),
+        (("assets", "fly"), "assets 'fly': unknown command; choose one of prepare, import"),
         (("baselines", "train", "tslamm"), "tslamm"),
         (("assets", "show", "mugg"), "mugg"),
         (("env", "describe", "TactileSLAM-v7"), "TactileSLAM-v7"),

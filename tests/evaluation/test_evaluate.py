@@ -118,14 +118,13 @@ class Recogniser:
         return np.zeros((count, NUM_JOINTS), dtype=np.float32)
 
 
-def test_a_policy_cannot_tell_which_object_it_holds(tmp_path, monkeypatch) -> None:
+def test_a_policy_cannot_tell_which_object_it_holds(tmp_path) -> None:
     """It studies one evaluation with the answers, then guesses in another: no clue beats chance, which is one half."""
     episodes = [(name, pose, seed) for name in ("phone", "cubelarge") for seed in (0, 1) for pose in range(8)]
     runs = []
     for salt in ("1", "2"):
         recogniser = Recogniser()
-        monkeypatch.setattr(evaluation, "make_baseline", lambda *_, policy=recogniser: policy)
-        config = EvaluationConfig("random", ("phone", "cubelarge"), seeds=(0, 1), policy_salt=salt)
+        config = EvaluationConfig(recogniser, ("phone", "cubelarge"), seeds=(0, 1), policy_salt=salt)
         evaluation.explore(config, tmp_path / salt, lambda *_: None)
         runs.append([(c, name) for c, (name, _, _) in zip(recogniser.clues, shuffled(salt, episodes), strict=True)])
     studied, played = runs
@@ -316,7 +315,7 @@ def test_episodes_of_other_assets_are_not_mixed(tmp_path: Path) -> None:
     config = EvaluationConfig("random", ("phone",))
     folder = tmp_path / "rollouts" / "random"
     folder.mkdir(parents=True)
-    (folder / "source.json").write_text(json.dumps({"baseline": "random", "asset_manifest_sha256": "another"}))
+    (folder / "source.json").write_text(json.dumps({"policy": "random", "asset_manifest_sha256": "another"}))
     with pytest.raises(InvalidInputError, match=r"holds other episodes \(another .*asset_manifest_sha256"):
         evaluate(config, {}, tmp_path)
 
@@ -328,7 +327,7 @@ def test_episodes_of_other_assets_are_not_mixed(tmp_path: Path) -> None:
         ({"objects": ()}, "at least one object"),
         ({"seeds": ()}, "one seed"),
         ({"seeds": (1, 1)}, "different"),
-        ({"baseline": "nope"}, "unknown"),
+        ({"policy": "nope"}, "unknown"),
     ],
 )
 def test_bad_evaluations(change, message: str) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,10 +13,11 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
+from tslam_bench.cli.commands import run_command
+from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import DEFAULT_SPLIT
-from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, write_json
 from tslam_bench.objects import splits, store
 
@@ -111,36 +111,18 @@ class Verify:
     """Split (default: all that are prepared)."""
 
 
-Command = (
-    Annotated[Prepare, tyro.conf.subcommand("prepare")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Show, tyro.conf.subcommand("show")]
-    | Annotated[Verify, tyro.conf.subcommand("verify")]
-)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Runs ``tslam-bench assets``. Exits with status 2 and one line on standard error for bad input."""
-    command: Any = tyro.cli(
-        Command,
-        args=arguments,
-        prog="tslam-bench assets",
-        description="Prepare, import, list, show and verify the benchmark's objects.",
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
-    handlers: dict[type, Callable[[Any], None]] = {
-        Prepare: _prepare,
-        Import: _import,
-        List: _list,
-        Show: _show,
-        Verify: _verify,
+def main(arguments: Sequence[str]) -> None:
+    """Runs ``tslam-bench assets`` with the given arguments. Raises BenchmarkError for bad input."""
+    commands = {
+        "prepare": (Prepare, _prepare),
+        "import": (Import, _import),
+        "list": (List, _list),
+        "show": (Show, _show),
+        "verify": (Verify, _verify),
     }
-    try:
-        handlers[type(command)](command)
-    except BenchmarkError as error:
-        print(f"tslam-bench assets: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_command(
+        "tslam-bench assets", "The benchmark's objects and its hand, and meshes of your own.", commands, arguments
+    )
 
 
 def _check_workers(workers: int, time_limit: float) -> None:
@@ -189,14 +171,16 @@ def _show_progress(
     from tslam_bench.preparation.schedule import prepare_distinct
 
     outcomes: dict[str, Any] = {}
-    with tqdm(total=count or len(items), unit="object", desc=title, dynamic_ncols=True) as bar:
+    done, total = 0, count or len(items)
+    with Progress(title, "object", total) as bar:
         for outcome in prepare_distinct(items, count, workers=workers, time_limit=time_limit, recheck=recheck):
             dropped = outcome.name in outcomes
             outcomes[outcome.name] = outcome
             if dropped:
-                bar.update(-1 if count is not None else 0)
+                done -= count is not None
             elif count is None or outcome.record is not None:
-                bar.update()
+                done += 1
+            bar.show(done)
             if outcome.record is None:
                 bar.write(f"{outcome.name}: {outcome.status}: {outcome.message}")
             elif outcome.status == "prepared":
@@ -335,9 +319,12 @@ def _verify(command: Verify) -> None:
     checked = [splits.check_split(command.split)] if command.split else [*splits.SPLITS]
     lines, count = [], 0
     for split in checked:
-        for name in tqdm(splits.prepared_names(split), unit="object", desc=f"verifying {split}", dynamic_ncols=True):
-            count += 1
-            lines += store.damage(name, split)
+        names = splits.prepared_names(split)
+        with Progress(f"verifying {split}", "object", len(names)) as bar:
+            for done, name in enumerate(names):
+                lines += store.damage(name, split)
+                bar.show(done + 1)
+        count += len(names)
     for line in lines:
         print(line)
     if lines:

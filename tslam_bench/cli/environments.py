@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +12,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from tslam_bench.cli.commands import run_command
+from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import (
     CONTROL_STEP_SECONDS,
     ENVIRONMENT_ID,
@@ -46,7 +48,7 @@ class Describe:
 
 @dataclass(frozen=True)
 class Video:
-    """Record one episode of a registered explorer as an animated picture (needs a Vulkan device)."""
+    """Record one episode of a policy as an animated picture (needs a Vulkan device)."""
 
     environment: str = ENVIRONMENT_ID
     """Environment id."""
@@ -54,8 +56,12 @@ class Video:
     """A prepared object of any split."""
     pose: int = 0
     """Pose, one of the environment's."""
-    baseline: str = "heuristic"
-    """A scripted explorer (tslam-bench baselines list)."""
+    policy: str = "heuristic"
+    """Policy: an id (tslam-bench baselines list), or your own as module:Class or path/to/file.py:Class."""
+    policy_arguments: tuple[str, ...] = ()
+    """Arguments of its class: key=value pairs or one JSON object."""
+    model: Path | None = None
+    """Trained model, if it needs one."""
     seed: int = 0
     """Seed of the episode."""
     every: int = 2
@@ -64,24 +70,10 @@ class Video:
     """File to write (.webp or .gif)."""
 
 
-Command = (
-    Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Describe, tyro.conf.subcommand("describe")]
-    | Annotated[Video, tyro.conf.subcommand("video")]
-)
-
-
 def main(arguments: Sequence[str]) -> None:
     """Runs ``tslam-bench env`` with the given arguments. Raises BenchmarkError for bad input."""
-    command: Any = tyro.cli(
-        Command,
-        args=list(arguments),
-        prog="tslam-bench env",
-        description="List the environments, describe their spaces, record a video.",
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
-    handlers: dict[type, Callable[[Any], None]] = {List: _list, Describe: _describe, Video: _video}
-    handlers[type(command)](command)
+    commands = {"list": (List, _list), "describe": (Describe, _describe), "video": (Video, _video)}
+    run_command("tslam-bench env", "The environments: ids, spaces, and pictures.", commands, arguments)
 
 
 def environment_rows() -> list[dict[str, Any]]:
@@ -158,7 +150,6 @@ def _video(command: Video) -> None:
     import gymnasium
     import numpy as np
     from PIL import Image
-    from tqdm import tqdm
 
     from tslam_bench.engine.rendering import vulkan_device_available
     from tslam_bench.files import atomic_file
@@ -170,9 +161,12 @@ def _video(command: Video) -> None:
         raise AssetError(
             "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU"
         )
-    from tslam_bench.evaluation.policies import make_baseline  # a command may use what the library must not
+    from tslam_bench.evaluation.policies import make_baseline, policy_label
+    from tslam_bench.evaluation.policy import CheckedPolicy
+    from tslam_bench.plugins import parse_arguments
 
-    explorer = make_baseline(command.baseline)
+    made = make_baseline(command.policy, command.model, **parse_arguments(command.policy_arguments))
+    explorer = CheckedPolicy(made, policy_label(command.policy))
     environment = gymnasium.make(
         variant.id,
         object=command.object,
@@ -183,11 +177,13 @@ def _video(command: Video) -> None:
     observation, _ = environment.reset(seed=command.seed)
     explorer.reset(1, command.seed)
     frames = []
-    for step in tqdm(range(HORIZON), desc="steps"):
-        action = explorer.act({key: value.numpy() for key, value in observation.items()})
-        observation, *_ = environment.step(action)
-        if step % command.every == 0:
-            frames.append(Image.fromarray(np.asarray(environment.render())[0]))
+    with Progress("steps", "step", HORIZON) as bar:
+        for step in range(HORIZON):
+            action = explorer.act({key: value.numpy() for key, value in observation.items()})
+            observation, *_ = environment.step(action)
+            if step % command.every == 0:
+                frames.append(Image.fromarray(np.asarray(environment.render())[0]))
+            bar.show(step + 1)
     environment.close()
     milliseconds = round(1000 * CONTROL_STEP_SECONDS * command.every)
     with atomic_file(command.output) as temporary:

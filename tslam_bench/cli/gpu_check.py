@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from tslam_bench.cli.commands import parse
 from tslam_bench.constants import ENVIRONMENT_ID, QUICK_OBJECTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.registration import make_vec
@@ -39,7 +40,7 @@ class GpuCheck:
 
 def main(arguments: Sequence[str]) -> None:
     """Runs ``tslam-bench gpu-check`` with the given arguments. Raises BenchmarkError for bad input or no GPU."""
-    command = tyro.cli(GpuCheck, args=list(arguments), prog="tslam-bench gpu-check")
+    command: GpuCheck = parse("tslam-bench gpu-check", GpuCheck, arguments)
     variant = get_variant(command.environment)
     import torch
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from tslam_bench.cli.commands import run_command
+from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, WORKSPACE_EDGE
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file
@@ -21,29 +21,18 @@ from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.training_config import TrainingConfig
 
-_USAGE = """usage: tslam-bench reconstruct COMMAND ...
-
-From touched and visited grids to a shape.
-
-commands:
-  list   name the reconstructors
-  train  train a learned one on simulated touches
-  run    reconstruct from grids in a file
-
-tslam-bench reconstruct COMMAND --help tells more."""
-
 
 @dataclass(frozen=True)
-class ListArguments:
-    """Names the reconstructors."""
+class List:
+    """Name the reconstructors."""
 
     json: bool = False
     """Print JSON instead of a table."""
 
 
 @dataclass(frozen=True)
-class TrainArguments:
-    """Trains a learned reconstructor on simulated touches of prepared objects.
+class Train:
+    """Train a learned reconstructor on simulated touches of prepared objects.
 
     A run that was stopped goes on where it was saved last; a finished one is left alone.
     """
@@ -66,15 +55,15 @@ class TrainArguments:
 
 
 @dataclass(frozen=True)
-class RunArguments:
-    """Reconstructs a shape from touched and visited grids, and writes it as a mesh or a probability grid."""
+class Run:
+    """Reconstruct a shape from touched and visited grids, and write it as a mesh or a probability grid."""
 
     touched: tuple[Path, ...]
     """One or more .npz files with the arrays touched and, optionally, visited; they are merged."""
     output: Path
     """File to write: .ply, .stl, .obj or .off for a mesh in metres, .npz for the probabilities."""
     reconstructor: str = "hull"
-    """Which one (tslam-bench reconstruct list)."""
+    """Which one: an id (tslam-bench reconstruct list), or your own as module:Class or path/to/file.py:Class."""
     model: Path | None = None
     """Checkpoint, for those that need one."""
     poses: tuple[int, ...] = ()
@@ -91,20 +80,15 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
         BenchmarkError: bad input; the message is one line.
     """
-    commands = {"list": _list, "train": _train, "run": _run}
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_USAGE)
-        sys.exit(0 if arguments else 2)
-    if arguments[0] not in commands:
-        raise InvalidInputError(f"reconstruct {arguments[0]!r}: unknown command; choose one of {', '.join(commands)}")
-    commands[arguments[0]](list(arguments[1:]))
+    commands = {"list": (List, _list), "train": (Train, _train), "run": (Run, _run)}
+    about = "From touched and visited grids to a shape."
+    run_command("tslam-bench reconstruct", about, commands, arguments)
 
 
-def _list(arguments: list[str]) -> None:
-    parsed = tyro.cli(ListArguments, args=arguments, prog="tslam-bench reconstruct list")
+def _list(parsed: List) -> None:
     registered = list_reconstructors()
     if parsed.json:
-        print(json.dumps([dataclasses.asdict(info) for info in registered], indent=2))
+        print(json.dumps([spec.row() for spec in registered], indent=2))
         return
     rows = [("id", "needs", "nothing touched", "summary")]
     rows += [(info.id, info.needs, info.empty, info.summary) for info in registered]
@@ -113,14 +97,11 @@ def _list(arguments: list[str]) -> None:
         print("  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]]))
 
 
-def _train(arguments: list[str]) -> None:
-    from tqdm import tqdm
-
+def _train(parsed: Train) -> None:
     from tslam_bench.reconstruction.learned import network_config
     from tslam_bench.reconstruction.training import train
     from tslam_bench.reconstruction.training_objects import load_training_shapes, training_names
 
-    parsed = tyro.cli(TrainArguments, args=arguments, prog="tslam-bench reconstruct train")
     config = parsed.config
     config.check()
     network_config(config.architecture, config.size)
@@ -131,23 +112,19 @@ def _train(arguments: list[str]) -> None:
         if parsed.threshold_objects:
             raise
         held_out = []
-    with tqdm(total=len(names) + len(held_out), unit="object", desc="sample objects", mininterval=1.0) as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.update()
-
-        shapes = load_training_shapes(names, parsed.split, config.seed, progress=advance)
-        threshold_shapes = load_training_shapes(held_out, parsed.threshold_split, config.seed, progress=advance) or None
-
-    with tqdm(total=config.steps, unit="step", desc=f"train {config.architecture}", mininterval=1.0) as bar:
+    with Progress("sample objects to learn from", "object") as bar:
+        shapes = load_training_shapes(names, parsed.split, config.seed, progress=bar.show)
+    with Progress("sample objects for the threshold", "object") as bar:
+        threshold_shapes = (
+            load_training_shapes(held_out, parsed.threshold_split, config.seed, progress=bar.show) or None
+        )
+    with Progress(f"train {config.architecture}", "step", config.steps) as bar:
 
         def show(done: int, loss: float) -> None:
-            bar.update(done - bar.n)
-            if not math.isnan(loss):
-                bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
+            bar.show(done, note="" if math.isnan(loss) else f"loss {loss:.3f}")
 
         reconstructor = train(shapes, config, parsed.output, parsed.log, threshold_shapes, show)
-        bar.update(config.steps - bar.n)
+        bar.show(config.steps)
     assert reconstructor is not None  # only `stop` ends a run early
     print(
         f"{parsed.output}: {config.architecture}, {config.steps} steps on {len(shapes)} objects, "
@@ -155,8 +132,7 @@ def _train(arguments: list[str]) -> None:
     )
 
 
-def _run(arguments: list[str]) -> None:
-    parsed = tyro.cli(RunArguments, args=arguments, prog="tslam-bench reconstruct run")
+def _run(parsed: Run) -> None:
     suffix = parsed.output.suffix.lower()
     if suffix not in (".ply", ".stl", ".obj", ".off", ".npz"):
         raise InvalidInputError(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +13,8 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from tqdm import tqdm
 
+from tslam_bench.cli.progress import Progress
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import write_json
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
@@ -53,8 +51,8 @@ def score_main(arguments: Sequence[str]) -> None:
     scores = []
     with worker_pool(parsed.workers) as pool:
         for path, file in zip(parsed.submissions, files, strict=True):
-            with progress(f"score {path.name}", "object") as show:
-                scores.append(score_submission(path, parsed.objects or None, pool, show))
+            with Progress(f"score {path.name}", "object", leave=False) as bar:
+                scores.append(score_submission(path, parsed.objects or None, pool, bar.show))
             if file is not None:
                 write_json(file, scores[-1].to_json())
     if parsed.json:
@@ -140,15 +138,3 @@ def check_workers(workers: int) -> None:
     """Raises InvalidInputError for a number of processes below 1."""
     if workers < 1:
         raise InvalidInputError(f"--workers {workers}: give at least 1")
-
-
-@contextlib.contextmanager
-def progress(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on standard error that is set with (done, all)."""
-    with tqdm(desc=description, unit=unit, file=sys.stderr, mininterval=0.5, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show

@@ -1,10 +1,13 @@
-"""Evaluates one explorer: episodes, merged grids, reconstructions, submissions (protocol sections 6, 9 and 12).
+"""Evaluates one policy: episodes, merged grids, reconstructions, submissions (protocol sections 6, 9 and 12).
 
 Layout below the output folder::
 
     rollouts/<explorer>/source.json
     rollouts/<explorer>/<object>/pose<k>_seed<s>.npz
+    reconstructors/<explorer>-<reconstructor>.json
     submissions/<explorer>-<reconstructor>/
+
+The two kinds of JSON files say what the results depend on: results of another model, or of code that has changed, are not mixed.
 
 Every file is written whole or not at all and is not made again, so a run that was killed goes on where it stopped.
 """
@@ -13,7 +16,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -23,14 +26,27 @@ from numpy.typing import NDArray
 from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES
 from tslam_bench.episodes import check_salt, new_salt, shuffled
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, BaselineSpec, get_baseline, make_baseline
+from tslam_bench.evaluation.policies import (
+    METADATA_FILE,
+    PolicySpec,
+    get_baseline,
+    make_baseline,
+    policy_label,
+    policy_source,
+)
+from tslam_bench.evaluation.policy import CheckedPolicy
 from tslam_bench.evaluation.rollouts import Rollout, roll_out_batch
-from tslam_bench.files import ensure_writable_directory, sha256_file, write_json
+from tslam_bench.files import ensure_writable_directory, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.objects.splits import object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256, load_object
-from tslam_bench.reconstruction.registry import make_reconstructor
+from tslam_bench.reconstruction.registry import (
+    ReconstructorSpec,
+    get_reconstructor,
+    make_reconstructor,
+    reconstructor_source,
+)
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.registration import make_vec
 from tslam_bench.scoring.info import SubmissionInfo, Training
@@ -50,30 +66,40 @@ class EvaluationConfig:
     """What to evaluate.
 
     Attributes:
-        baseline: registered id.
+        policy: registered id, ``module:Class``, a class or function, or a policy that is already made.
         objects: objects of the test split; aliases are resolved.
         seeds: repetitions; each is 8 episodes per object.
         object_set: ``quick`` or ``test``: which ranking the submissions are for.
-        model: directory of the trained model of a learned baseline.
-        deterministic: a learned baseline acts by the mean of its policy.
+        model: directory of the trained model of a learned baseline, or what a policy of the user's reads.
+        arguments: handed to the policy's class or function.
         policy_salt: hexadecimal digits from which the explorer's random numbers and the order of the episodes come; None
             takes that of the episodes which are there already, or draws one.
         label: remark that is shown beside every figure of the submission.
+        authors: whose submission it is.
+        privileged: the policy saw or was rewarded with the true shape; known of registered ones.
         processes: worker processes that simulate; None means the cores. Results do not depend on it.
+        spec: what ``policy`` is.
     """
 
-    baseline: str
+    policy: Any
     objects: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
     object_set: Literal["quick", "test"] = "test"
     model: Path | None = None
-    deterministic: bool = False
+    arguments: Mapping[str, Any] = field(default_factory=dict)
     policy_salt: str | None = None
     label: str = ""
+    authors: tuple[str, ...] = ("The tslam-bench authors",)
+    privileged: bool = False
     processes: int | None = None
+    spec: PolicySpec = field(init=False)
 
     def __post_init__(self) -> None:
-        get_baseline(self.baseline)
+        object.__setattr__(self, "spec", get_baseline(self.policy))
+        if "model" in self.arguments:
+            raise InvalidInputError("argument 'model': give it as the model, so that its content is recorded")
+        if self.spec.kind == "reference" and (self.arguments or self.model):
+            raise InvalidInputError(f"policy {self.spec.id!r}: a reference takes no arguments and no model")
         if self.policy_salt is not None:
             check_salt(self.policy_salt)
         if not self.objects or not self.seeds:
@@ -83,30 +109,47 @@ class EvaluationConfig:
         object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name) for name in self.objects)))
 
 
-def make_reconstructors(
-    specifications: Sequence[str], learning_objects: Sequence[str] = ()
-) -> dict[str, Reconstructor]:
-    """Reconstructors by id, from ``ID`` or, for those that have learned, ``ID=MODEL``; ``none`` alone gives none.
+@dataclass(frozen=True)
+class ChosenReconstructor:
+    """A reconstructor, and what its results depend on."""
 
-    ``learning_objects`` names the train objects that ``mean_shape`` and ``retrieval`` are built from; empty: all prepared.
+    spec: ReconstructorSpec
+    made: Reconstructor
+    source: Mapping[str, Any]
+
+
+def make_reconstructors(
+    specifications: Sequence[Any], learning_objects: Sequence[str] = ()
+) -> dict[str, ChosenReconstructor]:
+    """Reconstructors by id. ``none`` alone gives none.
+
+    Args:
+        specifications: ``ID``, ``module:name`` or, for those that have learned, ``ID=MODEL`` or ``module:name=MODEL``; or
+            classes, functions, or reconstructors that are already made.
+        learning_objects: train objects that ``mean_shape`` and ``retrieval`` are built from; empty: all prepared.
 
     Raises:
         InvalidInputError: unknown id, a model that is missing or unreadable, or one id twice.
+        UserCodeError: the user's code raised something.
     """
     if tuple(specifications) == ("none",):
         return {}
-    reconstructors: dict[str, Reconstructor] = {}
+    reconstructors: dict[str, ChosenReconstructor] = {}
     for specification in specifications:
-        name, _, model = specification.partition("=")
-        if name in reconstructors:
-            raise InvalidInputError(f"reconstructor {name!r}: given twice")
-        reconstructors[name] = make_reconstructor(name, Path(model) if model else None, objects=learning_objects)
+        name, _, path = specification.partition("=") if isinstance(specification, str) else (specification, "", "")
+        model = Path(path) if path else None
+        spec = get_reconstructor(name)
+        if spec.id in reconstructors:
+            raise InvalidInputError(f"reconstructor {spec.id!r}: given twice")
+        made = make_reconstructor(name, model, objects=learning_objects)
+        source = reconstructor_source(name, model, learning_objects)
+        reconstructors[spec.id] = ChosenReconstructor(spec, made, source)
     return reconstructors
 
 
 def evaluate(
     config: EvaluationConfig,
-    reconstructors: Mapping[str, Reconstructor],
+    reconstructors: Mapping[str, ChosenReconstructor],
     output: Path,
     on_progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Path]:
@@ -115,7 +158,7 @@ def evaluate(
 
     Args:
         config: what to evaluate.
-        reconstructors: by id.
+        reconstructors: see :func:`make_reconstructors`.
         output: folder of the run.
         on_progress: called with (stage, done, total) after each episode and each object.
 
@@ -123,20 +166,24 @@ def evaluate(
         The submissions' folders.
 
     Raises:
-        InvalidInputError: a model is missing, or ``output`` holds episodes of another model.
+        InvalidInputError: a model is missing, ``output`` holds results of another model or of other code, or a policy or
+            reconstructor of the user's gave something unusable.
+        UserCodeError: the user's code raised something. Episodes that are finished are kept.
         AssetError: an object is not prepared, or ``output`` cannot be written.
     """
-    spec = get_baseline(config.baseline)
+    spec = config.spec
     report = on_progress or (lambda stage, done, total: None)
     folder = output / "rollouts" / spec.id
     source = explore(config, folder, report) if spec.kind != "reference" else {}
     submissions = []
     for name, reconstructor in reconstructors.items():
         submission = output / "submissions" / f"{spec.id}-{name}"
+        record = output / "reconstructors" / f"{submission.name}.json"
+        _record_source(record, reconstructor.source, f"{submission}: holds other reconstructions", submission.is_dir())
         with SubmissionWriter(submission, submission_info(config, name, source)) as writer:
             total = len(config.objects) * len(config.seeds)
             for done, (object_name, seed) in enumerate(_repetitions(config)):
-                _add_object(writer, spec, folder, reconstructor, object_name, seed)
+                _add_object(writer, spec, folder, reconstructor.made, object_name, seed)
                 report(f"reconstruct {name}", done + 1, total)
         submissions.append(submission)
     return submissions
@@ -149,17 +196,15 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
         what the episodes depend on: the content of ``source.json``.
 
     Raises:
-        InvalidInputError: ``folder`` holds episodes of another model, of other assets or of another salt.
+        InvalidInputError: ``folder`` holds episodes of another model, of other code, of other assets or of another salt.
     """
-    baseline = make_baseline(config.baseline, config.model, config.deterministic)
+    made = make_baseline(config.policy, config.model, **config.arguments)
+    baseline = CheckedPolicy(made, policy_label(config.policy))
     path = ensure_writable_directory(folder) / SOURCE_FILE
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     salt = config.policy_salt or known.get("policy_salt") or new_salt()
     source = _source(config, baseline.control_mode, salt)
-    if known not in ({}, source):
-        differing = ", ".join(key for key in source if known.get(key) != source[key])
-        raise InvalidInputError(f"{folder}: holds other episodes (another {differing}); delete it or move it away")
-    write_json(path, source)
+    _record_source(path, source, f"{folder}: holds other episodes", bool(known))
     episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
     missing = [e for e in shuffled(salt, episodes) if not episode_path(folder, *e).is_file()]
     report("explore", len(episodes) - len(missing), len(episodes))
@@ -177,6 +222,7 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
     )
     try:
         for first in range(0, len(missing), width):
+            baseline.playing = missing[first : first + width]
             for rollout in roll_out_batch(envs, baseline, missing[first : first + width], salt):
                 rollout.save(episode_path(folder, rollout.object, rollout.pose, rollout.seed))
                 done += 1
@@ -227,7 +273,7 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
 
     ``source`` is what :func:`explore` returned, empty for a reference.
     """
-    spec = get_baseline(config.baseline)
+    spec = config.spec
     training = Training()
     if spec.kind == "learned" and config.model is not None:
         metadata = _model_metadata(config.model)
@@ -238,14 +284,14 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
             hardware=f"{machine['processor']}, {machine['cores']} cores",
         )
     return SubmissionInfo(
-        method=f"{spec.id} + {reconstructor}",
+        method=f"{_with_arguments(spec.id, config.arguments)} + {reconstructor}",
         explorer=spec.id,
         reconstructor=reconstructor,
-        authors=("The tslam-bench authors",),
+        authors=config.authors,
         asset_manifest_sha256=manifest_sha256(config),
         seeds=config.seeds,
         object_set=config.object_set,
-        privileged=spec.privileged,
+        privileged=spec.privileged or config.privileged,
         package_version=__version__,
         reward_mode=spec.reward_mode,
         control_mode=source.get("control_mode", CONTROL_MODES[0]),
@@ -257,7 +303,7 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
 
 def _add_object(
     writer: SubmissionWriter,
-    spec: BaselineSpec,
+    spec: PolicySpec,
     folder: Path,
     reconstructor: Reconstructor,
     object_name: str,
@@ -292,14 +338,28 @@ def _model_metadata(model: Path) -> dict[str, Any]:
 
 def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str, Any]:
     """What the episodes depend on besides object, pose and seed."""
-    model = None if config.model is None else sha256_file(config.model / MODEL_FILE)
     return {
-        "baseline": config.baseline,
-        "model_sha256": model,
-        "deterministic": config.deterministic,
+        **policy_source(config.policy, dict(config.arguments), config.model),
         "control_mode": control_mode,
         "policy_salt": salt,
         "asset_manifest_sha256": asset_sha256(config.objects),
         "package_version": __version__,
         "environment": ENVIRONMENT_ID,
     }
+
+
+def _record_source(path: Path, source: Mapping[str, Any], others: str, resumed: bool) -> None:
+    """Writes what results depend on, or raises InvalidInputError (``others``) if those resumed depend on something else."""
+    known = json.loads(path.read_text(encoding="utf-8")) if resumed and path.is_file() else source
+    if known != source:
+        differing = ", ".join(key for key in source if known.get(key) != source[key])
+        raise InvalidInputError(f"{others} (another {differing}); delete it or move it away")
+    write_json(path, source)
+
+
+def _with_arguments(identifier: str, arguments: Mapping[str, Any]) -> str:
+    """The name of a policy with its arguments, so that two settings are told apart on a leaderboard."""
+    if not arguments:
+        return identifier
+    text = ", ".join(f"{key}={json.dumps(value)}" for key, value in arguments.items())
+    return f"{identifier}({text if len(text) <= 150 else text[:147] + '...'})"

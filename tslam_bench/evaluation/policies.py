@@ -1,14 +1,17 @@
-"""The registered explorers (protocol section 11): ids are fixed."""
+"""The registered policies: the benchmark's explorers (protocol section 11), whose ids are fixed, and the user's own."""
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
+from tslam_bench.constants import PRIVILEGED_EXPLORERS
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policy import Baseline
+from tslam_bench.evaluation.policy import Policy
+from tslam_bench.hand_constants import CONTROL_MODES
+from tslam_bench.plugins import Registry, Spec
 
 MODEL_FILE: Final = "model.safetensors"
 """A finished model's weights: numbers alone, so that a stranger's model cannot run code."""
@@ -17,92 +20,137 @@ METADATA_FILE: Final = "model.json"
 
 
 @dataclass(frozen=True)
-class BaselineSpec:
-    """One registered explorer.
+class PolicySpec(Spec):
+    """One registered policy.
 
     Attributes:
-        id: fixed identifier.
-        summary: one line for listings.
-        kind: ``scripted`` (acts by rule), ``learned`` (needs a trained model) or ``reference`` (no policy: the grids
-            come from the ground truth or stay empty).
+        kind: ``scripted`` (acts by rule), ``learned`` (needs a trained model), ``reference`` (no policy: the grids come
+            from the ground truth or stay empty) or ``own`` (the user's).
         reward_mode: reward that a learned explorer is trained with (protocol section 7); None for the others.
-        privileged: training or exploration reads the true shape, so the entry is marked in every ranking.
+        privileged: training or exploration reads the true shape, or there is none: the entry is marked in every ranking.
     """
 
-    id: str
-    summary: str
-    kind: Literal["scripted", "learned", "reference"]
+    kind: Literal["scripted", "learned", "reference", "own"] = "own"
     reward_mode: str | None = None
     privileged: bool = False
 
 
-def _learned(identifier: str, reward_mode: str, summary: str, privileged: bool = False) -> BaselineSpec:
-    return BaselineSpec(identifier, summary, "learned", reward_mode, privileged)
+def _scripted(identifier: str, factory: str, summary: str) -> PolicySpec:
+    return PolicySpec(identifier, summary, factory, kind="scripted")
 
 
-_SPECS = (
-    BaselineSpec("random", "uniform actions each step", "scripted"),
-    BaselineSpec("random_targets", "random absolute joint targets, each held for four steps", "scripted"),
-    BaselineSpec("heuristic", "power grasp from a randomly placed open hand, reopened and repeated", "scripted"),
-    _learned("tslam", "tslam", "PPO on novel touched voxels plus coverage of free space"),
-    _learned("tslam_no_coverage", "no_coverage", "PPO on novel touched voxels alone"),
-    _learned("tslam_no_discovery", "no_discovery", "PPO on coverage of free space alone"),
-    _learned("tslam_knn", "knn", "PPO on the distance of new contact points to known ones, plus coverage"),
-    _learned("tslam_points", "points", "PPO on the number of new contact points, plus coverage"),
-    _learned("tslam_contact", "contact", "PPO on being in contact, plus coverage"),
-    _learned("tslam_disagreement", "disagreement", "PPO on the change of the contacts' alpha shape, plus coverage"),
-    _learned(
-        "tslam_chamfer", "chamfer", "PPO on the Chamfer distance to the true surface, plus coverage", privileged=True
+def _learned(identifier: str, reward_mode: str, summary: str) -> PolicySpec:
+    return PolicySpec(
+        identifier,
+        summary,
+        "tslam_bench.baselines.learned_policy:load_policy",  # brings torch
+        {"baseline": identifier},
+        kind="learned",
+        reward_mode=reward_mode,
+        privileged=identifier in PRIVILEGED_EXPLORERS,
+    )
+
+
+def _reference(identifier: str, summary: str) -> PolicySpec:
+    return PolicySpec(identifier, summary, kind="reference", privileged=identifier in PRIVILEGED_EXPLORERS)
+
+
+_POLICIES: Final = Registry(
+    "policy",
+    "tslam_bench.policies",
+    (
+        _scripted("random", "tslam_bench.baselines.random_actions:RandomBaseline", "uniform actions in each step"),
+        _scripted(
+            "random_targets",
+            "tslam_bench.baselines.random_actions:RandomTargetsBaseline",
+            "random absolute joint targets, each held for four steps",
+        ),
+        _scripted(
+            "heuristic",
+            "tslam_bench.baselines.heuristic:HeuristicBaseline",
+            "power grasp from a randomly placed open hand, reopened and repeated",
+        ),
+        _learned("tslam", "tslam", "PPO on novel touched voxels plus coverage of free space"),
+        _learned("tslam_no_coverage", "no_coverage", "PPO on novel touched voxels alone"),
+        _learned("tslam_no_discovery", "no_discovery", "PPO on coverage of free space alone"),
+        _learned("tslam_knn", "knn", "PPO on the distance of new contact points to known ones, plus coverage"),
+        _learned("tslam_points", "points", "PPO on the number of new contact points, plus coverage"),
+        _learned("tslam_contact", "contact", "PPO on being in contact, plus coverage"),
+        _learned("tslam_disagreement", "disagreement", "PPO on the change of the contacts' alpha shape, plus coverage"),
+        _learned("tslam_chamfer", "chamfer", "PPO on the Chamfer distance to the true surface, plus coverage"),
+        _reference("oracle", "every surface voxel touched"),
+        _reference("nothing", "nothing touched"),
     ),
-    BaselineSpec("oracle", "reference: every surface voxel touched", "reference", privileged=True),
-    BaselineSpec("nothing", "reference: nothing touched", "reference", privileged=True),
+    PolicySpec,
 )
-_CLASSES: Final = {
-    "random": "tslam_bench.baselines.random_actions:RandomBaseline",
-    "random_targets": "tslam_bench.baselines.random_actions:RandomTargetsBaseline",
-    "heuristic": "tslam_bench.baselines.heuristic:HeuristicBaseline",
-    "learned": "tslam_bench.baselines.learned_policy:LearnedBaseline",  # brings torch
-}
-"""Where the policies live: the library names them, and imports none of them before one is made."""
-_BY_ID = {spec.id: spec for spec in _SPECS}
 
 
-def list_baselines() -> tuple[BaselineSpec, ...]:
-    """All registered explorers: the baselines in the order of protocol section 11, then the references."""
-    return _SPECS
+def register_policy(
+    id: str, factory: str | Callable[..., Policy], *, summary: str = "", privileged: bool = False
+) -> None:
+    """Makes a policy of your own known under an id, in every process that runs this line.
+
+    Args:
+        id: at most 64 of a-z, 0-9, ``_``, ``.``, ``-``; also names folders and the explorer of submissions.
+        factory: class, or function that returns a policy (:class:`tslam_bench.evaluation.policy.Policy`), or
+            ``module:name`` of one. It is called with the arguments that were asked for and, if one was given, ``model=PATH``.
+        summary: one line for listings.
+        privileged: the policy saw, or was rewarded with, anything that derives from the true shape.
+
+    Raises:
+        InvalidInputError: not an id, or one of the benchmark's own.
+    """
+    _POLICIES.register(PolicySpec(id, summary, factory, privileged=privileged))
 
 
-def get_baseline(identifier: str) -> BaselineSpec:
-    """The registered explorer ``identifier``.
+def list_baselines() -> tuple[PolicySpec, ...]:
+    """All registered policies: the baselines in the order of protocol section 11, the references, then the user's own."""
+    return _POLICIES.all()
+
+
+def get_baseline(policy: Any) -> PolicySpec:
+    """The spec of an id, of ``module:Class``, of a class or function, or of a policy itself.
 
     Raises:
         InvalidInputError: unknown id (the message lists the known ones).
     """
-    try:
-        return _BY_ID[identifier]
-    except KeyError:
-        raise InvalidInputError(f"baseline {identifier!r}: unknown; choose one of {', '.join(_BY_ID)}") from None
+    return _POLICIES.get(policy)
 
 
-def make_baseline(identifier: str, model: Path | None = None, deterministic: bool = False) -> Baseline:
-    """Builds the policy of a registered explorer.
+def make_baseline(policy: Any, model: Path | None = None, /, **arguments: Any) -> Policy:
+    """Builds a policy.
 
     Args:
-        identifier: a scripted or learned id.
-        model: directory that ``tslam-bench baselines train`` wrote; learned explorers need it.
-        deterministic: a learned explorer acts by the mean of its policy instead of sampling from it.
+        policy: see :func:`get_baseline`.
+        model: of a learned explorer, the directory that ``tslam-bench baselines train`` wrote; of a policy of the user's,
+            whatever it reads.
+        arguments: handed to its class or function. Learned explorers take ``deterministic``: act by the mean of the policy
+            instead of sampling from it.
 
     Raises:
-        InvalidInputError: unknown id, a reference (it has no policy), or a missing or unreadable model (the message
-            gives the training command).
+        InvalidInputError: unknown id, a reference (it has no policy), something that is not a policy, unknown
+            arguments, or a missing or unreadable model.
+        UserCodeError: the user's code raised something.
     """
-    spec = get_baseline(identifier)
-    if spec.kind == "reference":
+    spec = get_baseline(policy)
+    if spec.factory is None:
+        raise InvalidInputError(f"policy {spec.id!r}: a reference has no policy; evaluate it instead of acting with it")
+    made = _POLICIES.make(spec, arguments if model is None else {**arguments, "model": model}, ("reset", "act"))
+    mode = getattr(made, "control_mode", None)
+    if mode not in CONTROL_MODES:
         raise InvalidInputError(
-            f"baseline {identifier!r}: a reference has no policy; evaluate it instead of acting with it"
+            f"{_POLICIES.label(spec)}: its control_mode is {mode!r}; choose one of {', '.join(CONTROL_MODES)}"
         )
-    if spec.kind != "learned" and model is not None:
-        raise InvalidInputError(f"baseline {identifier!r}: takes no model; leave the argument out")
-    module, _, name = _CLASSES[spec.id if spec.kind == "scripted" else "learned"].partition(":")
-    made = getattr(importlib.import_module(module), name)
-    return made.load(spec, model, deterministic=deterministic) if spec.kind == "learned" else made()
+    return made
+
+
+def policy_source(policy: Any, arguments: dict[str, Any], model: Path | None) -> dict[str, Any]:
+    """What the episodes of a policy depend on: see :meth:`tslam_bench.plugins.Registry.source`."""
+    spec = get_baseline(policy)
+    file = model / MODEL_FILE if model is not None and spec.kind == "learned" else model
+    return _POLICIES.source(spec, arguments, file)
+
+
+def policy_label(policy: Any) -> str:
+    """What messages call a policy."""
+    return _POLICIES.label(get_baseline(policy))

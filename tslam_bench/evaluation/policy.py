@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import NUM_JOINTS
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.episodes import Episode
+from tslam_bench.errors import BenchmarkError, InvalidInputError
+from tslam_bench.hand_constants import JOINT_NAMES
+from tslam_bench.plugins import user_error
 
 
-class Baseline(Protocol):
+class Policy(Protocol):
     """A policy that explores ``num_envs`` objects side by side.
 
     All random numbers of an episode come from that episode's seed, so the actions do not depend on which other episodes
@@ -45,6 +48,77 @@ class Baseline(Protocol):
         Returns:
             (num_envs, 28) float32 in [-1, 1], in the joint order of protocol section 2.
         """
+
+
+class CheckedPolicy:
+    """A policy whose answers are checked in every step, so that a mistake is named where it is made.
+
+    Args:
+        policy: what to check; it gives the same actions as without.
+        label: what messages call it.
+
+    Attributes:
+        playing: the episodes of the batch, for messages; further ones of the batch repeat the last.
+    """
+
+    def __init__(self, policy: Policy, label: str) -> None:
+        self.control_mode = policy.control_mode
+        self.playing: Sequence[Episode] = ()
+        self._policy, self._label = policy, label
+        self._num_envs, self._step = 0, 0
+
+    def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
+        """See :class:`Policy`. Raises UserCodeError if the policy raises anything that is not an error of the benchmark."""
+        self._num_envs, self._step = num_envs, 0
+        try:
+            self._policy.reset(num_envs, seed)
+        except BenchmarkError:
+            raise
+        except Exception as error:
+            raise user_error(error, f"{self._label}: reset{self._where(None)}") from error
+
+    def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
+        """See :class:`Policy`.
+
+        Raises:
+            InvalidInputError: the actions are not finite float32 numbers in [-1, 1], one row of 28 per environment.
+            UserCodeError: the policy raised anything that is not an error of the benchmark.
+        """
+        try:
+            actions = self._policy.act(observation)
+        except BenchmarkError:
+            raise
+        except Exception as error:
+            raise user_error(error, f"{self._label}: act, step {self._step}{self._where(None)},") from error
+        expected = (self._num_envs, NUM_JOINTS)
+        fits = isinstance(actions, np.ndarray) and actions.dtype == np.float32 and actions.shape == expected
+        if not (fits and (np.abs(actions) <= 1).all()):  # NaN is not at most 1
+            raise InvalidInputError(f"{self._label}: act returned {self._fault(actions, expected)}")
+        self._step += 1
+        return actions
+
+    def _fault(self, actions: Any, expected: tuple[int, int]) -> str:
+        """What is wrong with ``actions``, in which step of which episode."""
+        place = f"in step {self._step}{self._where(None)}"
+        if not isinstance(actions, np.ndarray):
+            return f"a {type(actions).__name__} {place}, expected a numpy array"
+        if actions.shape != expected:
+            return f"an array of shape {actions.shape} {place}, expected {expected}"
+        if actions.dtype != np.float32:
+            return f"{actions.dtype} {place}, expected float32; use .astype(np.float32)"
+        env, joint = np.argwhere(~(np.abs(actions) <= 1))[0]
+        return (
+            f"{actions[env, joint]} for {JOINT_NAMES[joint]} (action {joint}) in step {self._step}{self._where(env)}; "
+            "actions have to be in [-1, 1]"
+        )
+
+    def _where(self, env: int | None) -> str:
+        """The episode of an environment; of None the first of the batch, and how many play beside it."""
+        if not self.playing:
+            return "" if env is None else f" of environment {env}"
+        name, pose, seed = self.playing[min(env or 0, len(self.playing) - 1)]
+        beside = len(self.playing) - 1 if env is None else 0
+        return f" of {name}, pose {pose}, seed {seed}" + (f" and {beside} beside it" if beside else "")
 
 
 def episode_generators(num_envs: int, seed: int | Sequence[int]) -> list[np.random.Generator]:

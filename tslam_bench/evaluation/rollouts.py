@@ -16,7 +16,7 @@ from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.episodes import Episode, episode_seed, policy_seed
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.observations import last_observation, observation_to_numpy, to_numpy
-from tslam_bench.evaluation.policy import Baseline
+from tslam_bench.evaluation.policy import Policy
 from tslam_bench.files import atomic_file
 from tslam_bench.grids import check_pose, pack, unpack
 
@@ -87,7 +87,7 @@ class Rollout:
         return rollout
 
 
-def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed: int, salt: str) -> Rollout:
+def roll_out(env: gym.Env, baseline: Policy, object_name: str, pose: int, seed: int, salt: str) -> Rollout:
     """Lets ``baseline`` explore ``object_name`` in ``pose`` for one episode.
 
     The environment starts from ``episode_seed(pose, seed)``, the baseline from ``policy_seed(salt, ...)``: equal arguments
@@ -131,7 +131,7 @@ def roll_out(env: gym.Env, baseline: Baseline, object_name: str, pose: int, seed
     )
 
 
-def roll_out_batch(envs: VectorEnv, baseline: Baseline, episodes: Sequence[Episode], salt: str) -> list[Rollout]:
+def roll_out_batch(envs: VectorEnv, baseline: Policy, episodes: Sequence[Episode], salt: str) -> list[Rollout]:
     """Lets ``baseline`` explore several (object, pose, seed) side by side.
 
     Bit for bit what :func:`roll_out` gives for each of them.

@@ -232,13 +232,15 @@ def _twice(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cells.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
 
 
-def load_reconstructor(path: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
+def load_reconstructor(model: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
     """The reconstructor of a checkpoint.
 
     Raises:
         InvalidInputError: see :func:`load_network`; also a checkpoint of another architecture than ``name``.
     """
-    architecture, network, threshold, training = load_network(path)
+    architecture, network, threshold, training = load_network(model)
     if name is not None and architecture != name:
-        raise InvalidInputError(f"{path}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor")
+        raise InvalidInputError(
+            f"{model}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor"
+        )
     return LearnedReconstructor(architecture, network, training, threshold, threads=threads)

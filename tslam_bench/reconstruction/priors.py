@@ -5,6 +5,8 @@ They bound from below what completing a shape by learning should bring.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -15,6 +17,7 @@ from tslam_bench.constants import OCCUPANCY_THRESHOLD
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.grids import turn
 from tslam_bench.reconstruction.inputs import GRID_SHAPE, check_grids, empty_volume
+from tslam_bench.reconstruction.training_objects import load_training_objects
 from tslam_bench.reconstruction.training_shapes import axis_rotations
 from tslam_bench.reconstruction.volume import Volume
 
@@ -121,3 +124,16 @@ class RetrievalReconstructor:
             return empty_volume()
         shape, rotation, _ = self.best_match(touched, visited)
         return Volume(turn(self._solids[shape], rotation).astype(np.float32), "linear")
+
+
+def load_mean_shape(split: str, cache: Path | None, objects: Sequence[str]) -> MeanShapeReconstructor:
+    """Built from prepared objects: see :func:`tslam_bench.reconstruction.training_objects.load_training_objects`."""
+    return MeanShapeReconstructor(np.stack([item.solid for item in load_training_objects(split, cache, objects)]))
+
+
+def load_retrieval(split: str, cache: Path | None, objects: Sequence[str]) -> RetrievalReconstructor:
+    """Built from prepared objects: see :func:`tslam_bench.reconstruction.training_objects.load_training_objects`."""
+    shapes = load_training_objects(split, cache, objects)
+    return RetrievalReconstructor(
+        np.stack([item.solid for item in shapes]), np.stack([item.surface for item in shapes])
+    )

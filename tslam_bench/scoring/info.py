@@ -10,18 +10,22 @@ import re
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-from tslam_bench.constants import ENVIRONMENT_ID, PRIVILEGED_REWARD_MODES, PROTOCOL_VERSION, REWARD_MODES
+from tslam_bench.constants import (
+    ENVIRONMENT_ID,
+    PRIVILEGED_EXPLORERS,
+    PRIVILEGED_REWARD_MODES,
+    PROTOCOL_VERSION,
+    REWARD_MODES,
+)
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES
+from tslam_bench.plugins import IDENTIFIER
 
 SCHEMA_VERSION: Final = 1
 """Version of the submission format."""
 OBJECT_SETS: Final = ("quick", "test")
 """What a submission covers: the five quick objects or the whole test split."""
-PRIVILEGED_EXPLORERS: Final = ("tslam_chamfer", "oracle")
-"""Explorers of the benchmark that read the true surface."""
 
-_IDENTIFIER = re.compile(r"[a-z0-9][a-z0-9_.-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _SALT = re.compile(r"[0-9a-fA-F]{1,64}")
 _STATED = ("schema_version", "protocol_version", "environment_id", "control_mode", "policy_salt")
@@ -108,7 +112,7 @@ class SubmissionInfo:
         for name in ("label", "contact", "link"):
             _text(getattr(self, name), name)
         for name in ("explorer", "reconstructor"):
-            if not _IDENTIFIER.fullmatch(_text(getattr(self, name), name)):
+            if not IDENTIFIER.fullmatch(_text(getattr(self, name), name)):
                 raise InvalidInputError(f"{name} {getattr(self, name)!r}: use at most 64 of a-z, 0-9, '_', '.', '-'")
         if self.link and not re.fullmatch(r"https?://\S+", self.link):
             raise InvalidInputError(f"link {self.link!r}: give an http(s) address or leave it empty")
@@ -150,7 +154,7 @@ class SubmissionInfo:
             used = f"explorer {self.explorer!r}"
             if self.reward_mode in PRIVILEGED_REWARD_MODES:
                 used = f"reward mode {self.reward_mode!r}"
-            raise InvalidInputError(f"privileged is false, but {used} reads the true surface; set privileged to true")
+            raise InvalidInputError(f"privileged is false, but {used} counts as privileged; set privileged to true")
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for ``submission.json``."""

@@ -1,0 +1,47 @@
+"""How a command ends: the one place where errors become one line and an exit status."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+from tslam_bench.errors import BenchmarkError, UserCodeError
+
+_PACKAGE = str(Path(__file__).parents[1])
+
+
+@contextlib.contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """Exits with 2 (bad input: one line on standard error), 1 (the user's own code raised something: its traceback, then one
+    line), 130 (interrupted) or 141 (the reader of a pipe has gone).
+    """
+    try:
+        yield
+    except UserCodeError as error:
+        _print_cause(error)
+        print(f"{program}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except BenchmarkError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted; run the same command again to go on", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # a reader such as `head` that has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+
+
+def _print_cause(error: UserCodeError) -> None:
+    """The traceback of what the user's code raised, from the first line of theirs on."""
+    cause = error.__cause__
+    if cause is None:
+        return
+    frames = cause.__traceback__
+    while frames is not None and frames.tb_next is not None and frames.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+        frames = frames.tb_next
+    traceback.print_exception(type(cause), cause, frames)

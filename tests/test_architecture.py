@@ -25,8 +25,9 @@ ALLOWED: dict[str, set[str]] = {
     "reconstruction": {"base", "geometry", "objects"},
     "scoring": {"base", "geometry", "objects", "reconstruction"},
     "registration": {"base", "engine"},
+    "wrappers": {"base", "engine"},
     "evaluation": {"base", "engine", "objects", "reconstruction", "registration", "scoring"},
-    "front": {"base", "registration", "evaluation", "reconstruction"},
+    "front": {"base", "registration", "evaluation", "reconstruction", "wrappers"},
     "cli": {
         "base",
         "geometry",

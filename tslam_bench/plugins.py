@@ -191,10 +191,14 @@ class _Made:
 
 
 def identifier_of(reference: str) -> str:
-    """An id for ``module:Class`` or ``path/to/file.py:Class``: ``mypkg:MyPolicy`` is ``mypkg.mypolicy``."""
+    """An id for ``module:Class`` or ``path/to/file.py:Class``: ``mypkg:MyPolicy`` is ``mypkg.mypolicy``.
+
+    A class of the script that runs has its own name alone.
+    """
     where, _, name = reference.rpartition(":")
     where = Path(where).stem if where.endswith(".py") else where
-    text = re.sub(r"[^a-z0-9_.-]+", "-", f"{where}.{name}".lower()).strip("-_.")
+    full = name if where == "__main__" else f"{where}.{name}"
+    text = re.sub(r"[^a-z0-9_.-]+", "-", full.lower()).strip("-_.")
     return text[-64:].lstrip("-_.") or "unnamed"
 
 

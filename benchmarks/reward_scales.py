@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from report import machine, markdown_table, print_table, replace_section, write_json
 from tqdm import tqdm
 
@@ -45,24 +46,28 @@ class Config:
 def episode_sums(config: Config, mode: str, policy: str) -> tuple[float, float]:
     """Mean episode sums of (the unscaled exploration term, newly visited voxels) in one reward mode."""
     explorer = make_baseline(policy)
-    environments = tslam_bench.make_vec(
-        ENVIRONMENT_ID,
-        len(config.objects),
-        "cpu",
-        objects=config.objects,
-        split="train",
-        reward_mode=mode,
-        control_mode=explorer.control_mode,
-        processes=config.processes,
+    environments = RecordEpisodeStatistics(
+        tslam_bench.make_vec(
+            ENVIRONMENT_ID,
+            len(config.objects),
+            "cpu",
+            objects=config.objects,
+            split="train",
+            reward_mode=mode,
+            control_mode=explorer.control_mode,
+            processes=config.processes,
+        )
     )
     exploration, visited = [], []
     try:
         for index in range(config.poses):
             episodes = [(name, 3 * index % NUM_POSES, 0) for name in config.objects]
-            for rollout in roll_out_batch(environments, explorer, episodes, SALT):
+            rollouts = roll_out_batch(environments, explorer, episodes, SALT)
+            returns = list(environments.return_queue)[-len(episodes) :]
+            for rollout, episode_return in zip(rollouts, returns, strict=True):
                 new = int(rollout.visited.sum())
                 coverage = 0.0 if mode == "no_coverage" else COVERAGE_WEIGHT * new
-                exploration.append((rollout.episode_return - coverage) / MODE_SCALE[mode])
+                exploration.append((episode_return - coverage) / MODE_SCALE[mode])
                 visited.append(new)
     finally:
         environments.close()

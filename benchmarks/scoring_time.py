@@ -28,8 +28,9 @@ from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
-from tslam_bench.scoring import metrics, prediction, scoring
+from tslam_bench.scoring import measure, metrics, prediction
 from tslam_bench.scoring.info import SubmissionInfo
+from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, Submission, SubmissionWriter, read_submission
 from tslam_bench.version import __version__
 
@@ -70,7 +71,7 @@ def write_submission(folder: Path, kind: str, items: list[PreparedObject], seeds
                     world = grids.object_to_world(found, pose)
                     steps = np.where(world, generator.integers(0, 200, world.shape), -1).astype(np.int16)
                     actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
-                    writer.add_rollout(item.name, pose, seed, actions, world, ~world, steps)
+                    writer.add_rollout(Rollout(item.name, pose, seed, actions, world, ~world, steps))
                     touched[pose] = found
                 for count, poses in RECONSTRUCTED_POSES.items():
                     merged = grids.merge(touched[pose] for pose in poses)
@@ -119,30 +120,29 @@ def main() -> None:
     stages = Stages()
     stages.time(Submission, "rollout", "reading rollouts")
     stages.time(Submission, "reconstruction", "reading volumes")
-    stages.time(scoring, "load_truth", "ground truth, once per object")
+    stages.time(measure, "load_truth", "ground truth, once per object")
     stages.time(Volume, "query", "probability at the points")
     stages.time(Volume, "triangles", "surface")
     stages.time(prediction, "sample_surface", "samples of the surface")
     stages.time(metrics, "match_surfaces", "nearest neighbours")
     stages.time(metrics, "calibration_error", "calibration error")
     for name in ("merge_touched_steps", "implausible_touches"):
-        stages.time(scoring, name, "touches")
-    for name in ("surface_iou_curve", "surface_iou"):
-        stages.time(metrics, name, "touches")
-    for name in ("recall_curve", "recall"):
-        stages.time(metrics.TouchCoverage, name, "touches")
+        stages.time(measure, name, "touches")
+    stages.time(metrics, "surface_iou_curve", "touches")
+    stages.time(metrics.TouchCoverage, "recall_curve", "touches")
     rows: dict[str, list[str]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in KINDS:
             path = write_submission(Path(folder), kind, items, arguments.seeds)
-            scoring.load_truth.cache_clear() if hasattr(scoring.load_truth, "cache_clear") else None
-            warm = read_submission(path, check=False)
-            scoring.score_object(warm, scoring.load_truth(items[0].name))
+            measure.load_truth.cache_clear() if hasattr(measure.load_truth, "cache_clear") else None
+            submission = read_submission(path)
+            measure.score_object(submission, measure.load_truth(items[0].name))
             stages.spent.clear()
             start = time.process_time()
-            submission = read_submission(path, check=False)
+            read_submission(path)
+            stages.spent["opening: hashes, checks"] = time.process_time() - start - sum(stages.spent.values())
             for item in items[1:]:
-                scoring.score_object(submission, scoring.load_truth(item.name))
+                measure.score_object(submission, measure.load_truth(item.name))
             total = time.process_time() - start
             count = (len(items) - 1) * arguments.seeds
             figures = {**stages.spent, "rest": total - sum(stages.spent.values()), "all": total}

@@ -46,7 +46,7 @@ class Config:
 
 def touched_voxels(run: Path) -> dict[str, float]:
     """Mean touched voxels per pose of every explorer whose rollouts the run holds."""
-    from tslam_bench.evaluation.rollouts import Rollout
+    from tslam_bench.scoring.rollout import Rollout
 
     counts = {}
     for folder in sorted((run / "rollouts").iterdir()):

@@ -17,7 +17,8 @@ from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.scoring import SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.score_file import SubmissionScore
+from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import INFO_FILE, Submission, read_submission
 
 from .page import build_page
@@ -65,10 +66,10 @@ def page_main(arguments: Sequence[str]) -> None:
     if not score_files and not submission_paths:
         raise InvalidInputError(f"{paths[0]}: holds neither submissions nor score files; run tslam-bench score first")
     scores = [_read_score(path) for path in score_files]
-    submissions: dict[str, tuple[Path, Submission]] = {}
+    submissions: dict[str, Submission] = {}
     for path in submission_paths:
         submission = read_submission(path)
-        submissions.setdefault(submission.content_hash, (path, submission))
+        submissions.setdefault(submission.content_hash, submission)
     ensure_writable_directory(parsed.output)  # before hours of scoring, not after
     scores = _score_missing(scores, submissions, parsed.workers)
     leaderboard = rank(scores)
@@ -117,7 +118,7 @@ def find_inputs(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def plan_pictures(
-    leaderboard: dict[str, Any], submissions: dict[str, tuple[Path, Submission]], objects: int
+    leaderboard: dict[str, Any], submissions: dict[str, Submission], objects: int
 ) -> dict[tuple[str, str, str], Picture]:
     """The pictures of a page: (kind, content hash, object) -> picture, of submissions whose files are at hand.
 
@@ -131,29 +132,30 @@ def plan_pictures(
             key = entry["content_hash"]
             if key not in submissions:
                 continue
-            path, submission = submissions[key]
+            submission = submissions[key]
             seed = submission.info.seeds[0]
             for name in names:
                 pictures["truth", "", name] = Picture("truth", name)
-                touched = touched_picture(path, submission, name, seed)
+                touched = touched_picture(submission, name, seed)
                 if touched:
                     pictures["touched", key, name] = touched
                 if submission.info.reconstructor != TOUCHED_AS_THEY_ARE:
-                    pictures["reconstruction", key, name] = Picture("reconstruction", name, path, key, seed)
+                    part = submission.of_object(name)
+                    pictures["reconstruction", key, name] = Picture("reconstruction", name, part, key, seed)
     return pictures
 
 
 def _score_missing(
-    scores: list[SubmissionScore], submissions: dict[str, tuple[Path, Submission]], workers: int
+    scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int
 ) -> list[SubmissionScore]:
     """Adds scores of submissions that have none; a score of other assets or of another version does not count."""
     current = [score for score in scores if score.content_hash not in submissions or _is_current(score)]
     scored = {score.content_hash for score in current}
-    missing = [path for key, (path, _) in submissions.items() if key not in scored]
+    missing = [submission for key, submission in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
-        for path in missing:
-            with Progress(f"score {path.name}", "object", leave=False) as bar:
-                current.append(score_submission(path, None, pool, bar.show))
+        for submission in missing:
+            with Progress(f"score {Path(submission.location).name}", "object", leave=False) as bar:
+                current.append(score_submission(submission, None, pool, bar.show))
     return current
 
 

@@ -25,9 +25,9 @@ from tslam_bench.files import atomic_file
 from tslam_bench.geometry.render import Camera, Colour, fit_camera, render, voxels_to_mesh
 from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring.measure import merge_touched_steps
 from tslam_bench.scoring.prediction import invalid_mesh
-from tslam_bench.scoring.scoring import merge_touched_steps
-from tslam_bench.scoring.submission import EXPLORATION_ORDER, Submission, read_submission
+from tslam_bench.scoring.submission import EXPLORATION_ORDER, Submission
 
 PICTURE_SIZE: Final = 232
 """Pixels across a picture; its height depends on the object."""
@@ -53,16 +53,16 @@ class Picture:
     Attributes:
         kind: the true mesh, the voxels touched after 8 poses, or the reconstruction from them.
         object: name in the test split.
-        submission: folder or zip archive; None for the true mesh.
-        content_hash: of the submission, or of the touched voxels; empty for the true mesh.
+        submission: what it is of; None for the true mesh.
+        content_hash: of the submission, or of the rollouts shown; empty for the true mesh.
         seed: of the submission.
 
-    Two pictures are equal if they show the same; the path is not compared.
+    Two pictures are equal if they show the same; the submission is not compared.
     """
 
     kind: Kind
     object: str
-    submission: Path | None = field(default=None, compare=False)
+    submission: Submission | None = field(default=None, compare=False)
     content_hash: str = ""
     seed: int = 0
 
@@ -123,7 +123,7 @@ def _draw_group(arguments: tuple[list[tuple[Picture, Path]], Path | None]) -> in
 def draw(picture: Picture, prepared: PreparedObject) -> bytes:
     """WebP bytes of one picture; empty bytes if there is nothing to show."""
     truth = trimesh.Trimesh(prepared.vertices, prepared.faces, process=False)
-    mesh = truth if picture.submission is None else _subject(picture, _open(picture.submission, picture.content_hash))
+    mesh = truth if picture.submission is None else _subject(picture, picture.submission)
     if len(mesh.faces) == 0:
         return b""
     camera, size = object_camera(truth)
@@ -160,26 +160,17 @@ def _subject(picture: Picture, submission: Submission) -> trimesh.Trimesh:
 
 
 @lru_cache(maxsize=64)
-def _open(path: Path, content_hash: str) -> Submission:
-    """The submission without another check; ``content_hash`` keys the cache."""
-    return read_submission(path, check=False)
-
-
-@lru_cache(maxsize=64)
 def _asset(name: str, cache: Path | None) -> str:
     return asset_sha256([name], cache=cache)
 
 
-def touched_picture(path: Path, submission: Submission, name: str, seed: int) -> Picture | None:
+def touched_picture(submission: Submission, name: str, seed: int) -> Picture | None:
     """The picture of what was touched after 8 poses, or None if the submission does not tell.
 
-    It is keyed by the grid itself: submissions that differ in the reconstructor only share it. A reference without rollouts
+    Submissions that differ in the reconstructor only share it: it is keyed by the rollouts. A reference without rollouts
     shows its reconstruction by ``grid``, which is what it says it touched.
     """
-    rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
-    if any(rollouts.values()):
-        touched = merge_touched_steps(rollouts) >= 0
-        return Picture("touched", name, path, hashlib.sha256(touched.tobytes()).hexdigest(), seed)
-    if submission.info.privileged and submission.info.reconstructor == TOUCHED_AS_THEY_ARE:
-        return Picture("touched", name, path, submission.content_hash, seed)
-    return None
+    key = submission.rollouts_hash(name, seed)
+    if not key and submission.info.privileged and submission.info.reconstructor == TOUCHED_AS_THEY_ARE:
+        key = submission.content_hash
+    return Picture("touched", name, submission.of_object(name), key, seed) if key else None

@@ -16,7 +16,7 @@ import numpy as np
 from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
 from tslam_bench.objects.splits import object_set
 from tslam_bench.scoring.aggregate import interval, probability_of_improvement, resampled_means
-from tslam_bench.scoring.scoring import CURVE_SPACING, SubmissionScore
+from tslam_bench.scoring.score_file import CURVE_SPACING, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.version import __version__
 

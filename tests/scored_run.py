@@ -18,7 +18,9 @@ from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.scoring.aggregate import Estimate
 from tslam_bench.scoring.info import SubmissionInfo, Training
-from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission
+from tslam_bench.scoring.rollout import Rollout
+from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
+from tslam_bench.scoring.scoring import score_submission
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
 
 NAMES = ("mug", "toruslarge")
@@ -60,7 +62,7 @@ def write_submission(
                 found = world & (generator.random(world.shape) < share)
                 steps = np.where(found, generator.integers(0, 200, world.shape), -1).astype(np.int16)
                 actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
-                writer.add_rollout(name, pose, 0, actions, found, ~world, steps)
+                writer.add_rollout(Rollout(name, pose, 0, actions, found, ~world, steps))
                 touched[pose] = grids.world_to_object(found, pose)
             for count, poses in RECONSTRUCTED_POSES.items():
                 merged = grids.merge(touched[pose] for pose in poses)

@@ -84,6 +84,19 @@ def atomic_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Makes ``target`` a hard link to ``source``, or a copy where the file system allows no link.
+
+    Neither refers to the other's path: each may be moved or deleted. Both are to be replaced only, never written in place.
+    """
+    with atomic_file(target) as temporary:
+        temporary.unlink()
+        try:
+            os.link(source.resolve(), temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
 @contextlib.contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
     """Yields a temporary directory beside ``path``; on success it replaces ``path``, on failure it is removed."""

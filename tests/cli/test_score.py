@@ -14,7 +14,8 @@ from scored_run import NAMES, fake_score, info
 from tslam_bench.cli import main
 from tslam_bench.cli.score import object_table, score_main, summary_table
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.scoring.scoring import SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.score_file import SubmissionScore
+from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import SubmissionWriter
 
 

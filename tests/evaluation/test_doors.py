@@ -28,8 +28,8 @@ from tslam_bench.plugins import content_sha256, identifier_of, parse_arguments
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.registry import get_reconstructor, list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring.measure import load_truth
 from tslam_bench.scoring.metrics import iou, surface_iou
-from tslam_bench.scoring.scoring import load_truth
 from tslam_bench.scoring.submission import read_submission
 
 SALT = "d00f"

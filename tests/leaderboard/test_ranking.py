@@ -9,7 +9,7 @@ from scored_run import fake_score
 from tslam_bench.leaderboard.page import group_explorers
 from tslam_bench.leaderboard.ranking import rank
 from tslam_bench.scoring.aggregate import interval, resampled_means
-from tslam_bench.scoring.scoring import SubmissionScore
+from tslam_bench.scoring.score_file import SubmissionScore
 
 
 def order(scores: list[SubmissionScore]) -> list[tuple[int | None, str]]:

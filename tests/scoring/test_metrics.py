@@ -86,7 +86,7 @@ def test_iou_at_the_points_of_an_object_is_unbiased_and_sharp(radius: float, shi
 
 def test_surface_iou_is_not_solid_iou(sphere) -> None:
     touched = surface_grid(sphere)
-    assert metrics.surface_iou(touched, sphere.surface) > 0.9
+    assert metrics.iou(touched, sphere.surface) > 0.9
     assert metrics.iou(touched, sphere.solid) < 0.5
 
 
@@ -309,7 +309,7 @@ def test_curves_agree_with_the_metric_at_every_step(sphere) -> None:
     for step in (0, 1, 4, 13, 20):
         touched = (steps >= 0) & (steps < step)
         assert recall[step] == pytest.approx(brute_recall(points, touched), abs=1e-12)
-        assert surface[step] == pytest.approx(metrics.surface_iou(touched, sphere.surface))
+        assert surface[step] == pytest.approx(metrics.iou(touched, sphere.surface))
 
 
 def test_area_under_curve() -> None:

@@ -19,7 +19,7 @@ from tslam_bench.geometry.nearest import NearestSamples
 from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
-from tslam_bench.scoring.scoring import Truth, score_reconstruction
+from tslam_bench.scoring.measure import Truth, score_reconstruction
 
 
 def winding(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:

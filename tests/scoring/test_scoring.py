@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,19 +17,21 @@ from prepared_shapes import surface_grid
 from tslam_bench import __version__, grids
 from tslam_bench.constants import HORIZON, WORKSPACE_EDGE
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.objects import store
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring import metrics
 from tslam_bench.scoring.info import SubmissionInfo
-from tslam_bench.scoring.scoring import (
+from tslam_bench.scoring.measure import (
     SHAPE_METRICS,
-    SubmissionScore,
     Truth,
-    aggregate,
     implausible_touches,
     merge_touched_steps,
     score_object,
     score_reconstruction,
 )
+from tslam_bench.scoring.rollout import Rollout
+from tslam_bench.scoring.score_file import SubmissionScore
+from tslam_bench.scoring.scoring import aggregate
 from tslam_bench.scoring.submission import (
     EXPLORATION_ORDER,
     RECONSTRUCTED_POSES,
@@ -58,17 +61,14 @@ def truth(box) -> Truth:
     return Truth.of(box)
 
 
-def explored(surface: np.ndarray, pose: int, share: float, seed: int) -> dict[str, np.ndarray]:
-    """Arguments of add_rollout: a random share of the surface voxels, in the world frame of the pose."""
+def explored(box, pose: int, share: float, seed: int) -> Rollout:
+    """A random share of the surface voxels."""
     generator = np.random.default_rng([pose, seed])
-    world = grids.object_to_world(surface, pose)
+    world = grids.object_to_world(surface_grid(box), pose)
     touched = world & (generator.random(world.shape) < share)
-    return {
-        "actions": generator.uniform(-1, 1, (200, 28)).astype(np.float32),
-        "touched": touched,
-        "visited": ~world,
-        "touched_step": np.where(touched, generator.integers(0, 200, world.shape), -1).astype(np.int16),
-    }
+    actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
+    steps = np.where(touched, generator.integers(0, 200, world.shape), -1).astype(np.int16)
+    return Rollout(box.name, pose, seed, actions, touched, ~world, steps)
 
 
 def submission(folder: Path, box, info: SubmissionInfo = INFO, skip: tuple[str, ...] = ()) -> Submission:
@@ -77,7 +77,7 @@ def submission(folder: Path, box, info: SubmissionInfo = INFO, skip: tuple[str, 
     with SubmissionWriter(folder, info) as writer:
         for seed in info.seeds:
             for pose in range(8):
-                writer.add_rollout(box.name, pose, seed, **explored(surface_grid(box), pose, 0.1, seed))
+                writer.add_rollout(explored(box, pose, 0.1, seed))
             for protocol in RECONSTRUCTED_POSES:
                 writer.add_reconstruction(box.name, protocol, seed, mesh)
     for name in skip:
@@ -183,9 +183,9 @@ def test_poses_are_turned_back_before_they_are_merged(tmp_path: Path, truth: Tru
     touched = np.zeros((32, 32, 32), dtype=bool)
     centres = grids.voxel_centres()
     for pose in EXPLORATION_ORDER[:4]:
-        world = explored(surface_grid(box), pose, 0.1, 0)["touched"]
+        world = explored(box, pose, 0.1, 0).touched
         touched |= grids.points_to_grid(centres[world] @ grids.pose_rotation(pose))  # rows: R^T p
-    assert result.poses["4"]["surface_iou"] == pytest.approx(metrics.surface_iou(touched, box.surface))
+    assert result.poses["4"]["surface_iou"] == pytest.approx(metrics.iou(touched, box.surface))
     assert result.poses["4"]["touched_surface_recall"] == pytest.approx(truth.coverage.recall(touched))
 
 
@@ -304,18 +304,72 @@ def test_scoring_is_deterministic(tmp_path: Path, truth: Truth, box) -> None:
     assert score_object(source, truth) == score_object(source, truth)
 
 
-# --- Imports ---------------------------------------------------------------------------------------------------
+# --- What is hashed is what is scored --------------------------------------------------------------------------
 
 
-def test_leaderboard_needs_no_simulator_and_no_torch() -> None:
-    """Every module of the leaderboard, imported in a fresh interpreter."""
-    code = """
+def test_a_submission_that_changes_before_it_is_scored_is_refused(tmp_path: Path, truth: Truth, box) -> None:
+    """Another good rollout in the place of one that was hashed, between reading and scoring."""
+    source = submission(tmp_path / "s", box)
+    explored(box, 3, 0.5, 1).save(tmp_path / "s" / "rollouts")
+    with pytest.raises(InvalidInputError, match=r"rollouts/box/pose3_seed1\.npz changed while it was read"):
+        score_object(source, truth)
+    again = read_submission(tmp_path / "s", objects=[box.name])
+    assert again.content_hash != source.content_hash and score_object(again, truth)
+    shutil.rmtree(tmp_path / "s")
+    with pytest.raises(InvalidInputError, match="cannot be read"):
+        score_object(again, truth)
+
+
+# --- A core without simulator ----------------------------------------------------------------------------------
+
+SCORE = """
 import importlib, pkgutil, sys
-import tslam_bench.leaderboard as package
-for module in pkgutil.iter_modules(package.__path__):
-    importlib.import_module(f"{package.__name__}.{module.name}")
-heavy = {"torch", "sapien", "mani_skill", "stable_baselines3", "mujoco", "coacd", "tensorboard"}
-print(sorted({name.partition(".")[0] for name in sys.modules} & heavy))
+
+class Without:
+    def __init__(self, finder):
+        self.finder = finder
+    def find_spec(self, name, *arguments):
+        return None if name.partition(".")[0] in HIDDEN else self.finder.find_spec(name, *arguments)
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
+import tslam_bench.leaderboard, tslam_bench.scoring
+for package in (tslam_bench.leaderboard, tslam_bench.scoring):
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"{package.__name__}.{module.name}")
+from pathlib import Path
+from tslam_bench.leaderboard.pictures import Picture, draw
+from tslam_bench.objects.store import load_object
+from tslam_bench.scoring.scoring import score_submission
+from tslam_bench.scoring.submission import read_submission
+folder, cache = map(Path, sys.argv[1:])
+submission = read_submission(folder)
+score = score_submission(submission, ["mug"], cache=cache)
+if "embreex" not in HIDDEN:
+    assert draw(Picture("touched", "mug", submission), load_object("mug", cache=cache))
+assert not HIDDEN & {name.partition(".")[0] for name in sys.modules}
+print(score.results[0].poses["8"]["iou"])
 """
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert output.strip() == "[]"
+SIMULATION = {"torch", "sapien", "mani_skill", "stable_baselines3", "tensorboard", "mujoco", "safetensors"}
+PREPARATION = {"coacd", "manifold3d", "collada", "lxml", "skimage", "networkx", "rtree"}
+
+
+@pytest.mark.parametrize("kind", ["volume", "mesh"])
+def test_scoring_and_the_page_need_few_packages(tmp_path: Path, box, kind: str) -> None:
+    """A fresh interpreter without simulator, networks and preparation; volumes need no libigl and no ray caster either."""
+    mug = replace(box, name="mug")
+    mesh = trimesh.Trimesh(box.vertices, box.faces, process=False)
+    _, _, faces = trimesh.proximity.closest_point(mesh, box.surface_points[:1])
+    store.write(mug, np.full(100_000, faces[0]), tmp_path / "cache")
+    with SubmissionWriter(tmp_path / "s", replace(INFO, seeds=(0,))) as writer:
+        for pose in range(8):
+            writer.add_rollout(explored(mug, pose, 0.1, 0))
+        for count in RECONSTRUCTED_POSES:
+            solid = mesh if kind == "mesh" else Volume(box.solid.astype(np.float32), "nearest")
+            writer.add_reconstruction("mug", count, 0, solid)
+    hidden = SIMULATION | PREPARATION | ({"igl", "embreex"} if kind == "volume" else set())
+    command = [sys.executable, "-c", f"HIDDEN = {hidden}" + SCORE, str(tmp_path / "s"), str(tmp_path / "cache")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert float(result.stdout) > 0.8

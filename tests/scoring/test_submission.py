@@ -20,6 +20,7 @@ from tslam_bench.errors import InvalidInputError
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring import untrusted_files
 from tslam_bench.scoring.info import SubmissionInfo, Training, parse_info
+from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.submission import (
     EXPLORATION_ORDER,
     RECONSTRUCTED_POSES,
@@ -60,10 +61,15 @@ def rollout_arrays(seed: int = 0) -> dict[str, np.ndarray]:
     }
 
 
+def mug(seed: int = 0) -> Rollout:
+    """The rollout of ``ROLLOUT``."""
+    return Rollout("mug", 3, 7, **rollout_arrays(seed))  # type: ignore[arg-type]
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     with SubmissionWriter(tmp_path / "sub", INFO) as writer:
-        writer.add_rollout("mug", 3, 7, **rollout_arrays())
+        writer.add_rollout(mug())
         writer.add_reconstruction("mug", 8, 0, Volume(np.random.default_rng(0).random((16, 16, 16))))
         writer.add_reconstruction("mug", 4, 0, trimesh.creation.icosphere(radius=0.05))
     return tmp_path / "sub"
@@ -119,7 +125,7 @@ def test_what_is_written_is_read(folder: Path, kind: str) -> None:
 
 def test_files_are_bit_identical_from_run_to_run(folder: Path, tmp_path: Path) -> None:
     with SubmissionWriter(tmp_path / "again", INFO) as writer:
-        writer.add_rollout("mug", 3, 7, **rollout_arrays())
+        writer.add_rollout(mug())
     for name in (ROLLOUT, "submission.json"):
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes()
 
@@ -143,7 +149,7 @@ def test_json_round_trip(changes: dict) -> None:
 
 def test_unfinished_is_refused_and_resumed(tmp_path: Path) -> None:
     writer = SubmissionWriter(tmp_path / "sub", INFO)
-    writer.add_rollout("mug", 3, 7, **rollout_arrays())
+    writer.add_rollout(mug())
     refused(tmp_path / "sub", "submission.json is missing", "resume")
     resumed = SubmissionWriter(tmp_path / "sub", replace(INFO, training=Training(4000, 0.7, "2 cores")))
     assert resumed.has_rollout("mug", 3, 7)
@@ -178,18 +184,21 @@ def test_another_submission_is_not_overwritten(folder: Path, change: dict) -> No
         ({"touched": np.zeros((32, 32, 32), bool)}, "disagree"),
         ({"touched_step": np.full((32, 32, 32), 200, np.int16)}, "outside"),
         ({"visited": np.zeros((32, 32), bool)}, "visited"),
+        ({"object": "../mug"}, "not the name of a rollout"),
+        ({"pose": 8}, "not the name of a rollout"),
+        ({"seed": -1}, "not the name of a rollout"),
     ],
 )
-def test_bad_rollouts_are_not_written(tmp_path: Path, change: dict, message: str) -> None:
-    writer = SubmissionWriter(tmp_path / "sub", INFO)
+def test_bad_rollouts_are_not_made(change: dict, message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
-        writer.add_rollout("mug", 3, 7, **(rollout_arrays() | change))
-    assert not writer.has_rollout("mug", 3, 7)
+        Rollout(**({"object": "mug", "pose": 3, "seed": 7} | rollout_arrays() | change))
 
 
 def test_bad_places_are_not_written(tmp_path: Path) -> None:
     writer = SubmissionWriter(tmp_path / "sub", INFO)
     volume = Volume(np.zeros((4, 4, 4)))
+    with pytest.raises(InvalidInputError, match="seed 1 is not among"):
+        writer.add_rollout(Rollout("mug", 3, 1, **rollout_arrays()))  # type: ignore[arg-type]
     for arguments, message in [
         (("../mug", 8, 0, volume), "check object"),
         (("mug", 3, 0, volume), "check object"),
@@ -200,6 +209,34 @@ def test_bad_places_are_not_written(tmp_path: Path) -> None:
         with pytest.raises(InvalidInputError, match=message):
             writer.add_reconstruction(*arguments)
     assert [p.name for p in (tmp_path / "sub").iterdir()] == [".submission.json.unfinished"]
+
+
+def test_a_stored_rollout_is_linked_and_the_link_can_be_moved(tmp_path: Path) -> None:
+    stored = mug().save(tmp_path / "run")
+    with SubmissionWriter(tmp_path / "linked", INFO) as writer:
+        writer.add_rollout(mug(), stored)
+    assert (tmp_path / "linked" / ROLLOUT).samefile(stored)
+    with SubmissionWriter(tmp_path / "written", INFO) as writer:
+        writer.add_rollout(mug())
+    linked, written = (read_submission(tmp_path / name) for name in ("linked", "written"))
+    assert linked.content_hash == written.content_hash == read_submission(zipped(tmp_path / "linked")).content_hash
+    assert linked.rollouts_hash("mug", 7) == written.rollouts_hash("mug", 7) != linked.rollouts_hash("mug", 0) == ""
+    mug(1).save(tmp_path / "run")  # replaces the file: the submission keeps what it has
+    stored.unlink()
+    (tmp_path / "linked").rename(tmp_path / "moved")
+    assert read_submission(tmp_path / "moved").content_hash == written.content_hash
+
+
+def test_a_rollout_is_copied_where_links_are_not_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(*_: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr(os, "link", no_links)
+    stored = mug().save(tmp_path / "run")
+    with SubmissionWriter(tmp_path / "sub", INFO) as writer:
+        writer.add_rollout(mug(), stored)
+    assert (tmp_path / "sub" / ROLLOUT).read_bytes() == stored.read_bytes()
+    assert not (tmp_path / "sub" / ROLLOUT).samefile(stored)
 
 
 # --- submission.json -------------------------------------------------------------------------------------------
@@ -420,6 +457,86 @@ def test_harmless_extras_are_ignored(folder: Path) -> None:
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("__MACOSX/sub/._submission.json", b"x")
     assert read_submission(path).content_hash == before
+
+
+# --- Files that change after they were checked ------------------------------------------------------------------
+
+
+def other_content(file: Path) -> None:
+    """Puts a valid file of the same kind in its place."""
+    if file.suffix == ".ply":
+        file.write_bytes(bytes(trimesh.creation.icosphere(radius=0.06).export(file_type="ply")))  # type: ignore[arg-type]
+    elif file.parts[-3] == "rollouts":
+        file.write_bytes(mug(1).to_bytes())
+    else:
+        np.savez_compressed(file, probability=np.zeros((16, 16, 16), np.float16), interpolation=np.array("linear"))
+
+
+@pytest.mark.parametrize("kind", ["folder", "zip"])
+@pytest.mark.parametrize("name", [ROLLOUT, VOLUME, "reconstructions/mug_4_seed0.ply"])
+@pytest.mark.parametrize("sent", [False, True])
+def test_what_was_hashed_is_what_is_read(folder: Path, kind: str, name: str, sent: bool) -> None:
+    path = folder if kind == "folder" else zipped(folder)
+    submission = read_submission(path)
+    hashed = submission.content_hash
+    if sent:  # to another process, as scoring and pictures do
+        submission = pickle.loads(pickle.dumps(submission.of_object("mug")))
+        assert submission.content_hash == hashed and submission.rollout("mug", 3, 7) is not None
+        submission = pickle.loads(pickle.dumps(submission))
+    other_content(folder / name)
+    if kind == "zip":
+        path.unlink()
+        zipped(folder)
+    assert read_submission(path).content_hash != hashed
+    read = {
+        ROLLOUT: lambda: submission.rollout("mug", 3, 7),
+        VOLUME: lambda: submission.reconstruction("mug", 8, 0),
+    }.get(name, lambda: submission.reconstruction("mug", 4, 0))
+    if (
+        kind == "zip" and not sent
+    ):  # the archive is still open: its own bytes are read, and they are those that were hashed
+        assert read() is not None
+        return
+    with pytest.raises(InvalidInputError, match=r"changed while it was read|is damaged") as caught:
+        read()
+    assert str(path) in str(caught.value) and name in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links need rights on Windows")
+@pytest.mark.parametrize("kind", ["gone", "link", "pipe", "longer"])
+def test_a_file_that_was_checked_and_is_no_file_any_more_is_refused(folder: Path, tmp_path: Path, kind: str) -> None:
+    submission = read_submission(folder)
+    file, same = folder / ROLLOUT, tmp_path / "same.npz"
+    same.write_bytes(file.read_bytes())
+    if kind == "longer":
+        file.write_bytes(file.read_bytes() + b"\0")
+    else:
+        file.unlink()
+    if kind == "link":
+        file.symlink_to(same)
+    elif kind == "pipe":
+        os.mkfifo(file)
+    with pytest.raises(InvalidInputError, match=r"cannot be read|changed while it was read"):
+        submission.rollout("mug", 3, 7)
+
+
+def test_a_file_that_changes_while_the_submission_is_opened_is_hashed_as_it_was_checked(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file is replaced right after it was read: opening reads none of them a second time."""
+    before = read_submission(folder).content_hash
+    read = untrusted_files.FileSource.read
+    seen: list[str] = []
+
+    def read_and_replace(source: untrusted_files.FileSource, name: str) -> bytes:
+        seen.append(name)
+        data = read(source, name)
+        (folder / name).write_bytes(b"replaced")
+        return data
+
+    monkeypatch.setattr(untrusted_files.FileSource, "read", read_and_replace)
+    assert read_submission(folder).content_hash == before
+    assert len(seen) == len(set(seen)) == 4
 
 
 # --- Paths, links, bombs ---------------------------------------------------------------------------------------

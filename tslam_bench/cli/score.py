@@ -18,7 +18,8 @@ from tslam_bench.cli.progress import Progress
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import write_json
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
-from tslam_bench.scoring.scoring import ObjectScore, SubmissionScore, score_submission, worker_pool
+from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
+from tslam_bench.scoring.scoring import score_submission, worker_pool
 
 
 @dataclass(frozen=True)

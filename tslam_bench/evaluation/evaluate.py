@@ -5,7 +5,7 @@ Layout below the output folder::
     rollouts/<explorer>/source.json
     rollouts/<explorer>/<object>/pose<k>_seed<s>.npz
     reconstructors/<explorer>-<reconstructor>.json
-    submissions/<explorer>-<reconstructor>/
+    submissions/<explorer>-<reconstructor>/     its rollouts are hard links to those above, where the file system allows
 
 The two kinds of JSON files say what the results depend on: results of another model, or of code that has changed, are not mixed.
 
@@ -35,7 +35,7 @@ from tslam_bench.evaluation.policies import (
     policy_source,
 )
 from tslam_bench.evaluation.policy import CheckedPolicy
-from tslam_bench.evaluation.rollouts import Rollout, roll_out_batch
+from tslam_bench.evaluation.rollouts import roll_out_batch
 from tslam_bench.files import ensure_writable_directory, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import CONTROL_MODES
@@ -50,6 +50,7 @@ from tslam_bench.reconstruction.registry import (
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.registration import make_vec
 from tslam_bench.scoring.info import SubmissionInfo, Training
+from tslam_bench.scoring.rollout import Rollout, rollout_file
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
 from tslam_bench.version import __version__
 
@@ -206,7 +207,7 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
     source = _source(config, baseline.control_mode, salt)
     _record_source(path, source, f"{folder}: holds other episodes", bool(known))
     episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
-    missing = [e for e in shuffled(salt, episodes) if not episode_path(folder, *e).is_file()]
+    missing = [e for e in shuffled(salt, episodes) if not (folder / rollout_file(*e)).is_file()]
     report("explore", len(episodes) - len(missing), len(episodes))
     if not missing:
         return source
@@ -224,17 +225,12 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
         for first in range(0, len(missing), width):
             baseline.playing = missing[first : first + width]
             for rollout in roll_out_batch(envs, baseline, missing[first : first + width], salt):
-                rollout.save(episode_path(folder, rollout.object, rollout.pose, rollout.seed))
+                rollout.save(folder)
                 done += 1
                 report("explore", done, len(episodes))
     finally:
         envs.close()
     return source
-
-
-def episode_path(folder: Path, object_name: str, pose: int, seed: int) -> Path:
-    """Where an episode lies below an explorer's folder."""
-    return folder / object_name / f"pose{pose}_seed{seed}.npz"
 
 
 def merged_grids(rollouts: Sequence[Rollout]) -> Grids:
@@ -317,12 +313,11 @@ def _add_object(
             for count in missing:
                 writer.add_reconstruction(object_name, count, seed, volume)
         return
-    rollouts = {pose: Rollout.load(episode_path(folder, object_name, pose, seed)) for pose in range(NUM_POSES)}
+    paths = {pose: folder / rollout_file(object_name, pose, seed) for pose in range(NUM_POSES)}
+    rollouts = {pose: Rollout.load(path) for pose, path in paths.items()}
     for pose, rollout in rollouts.items():
         if not writer.has_rollout(object_name, pose, seed):
-            writer.add_rollout(
-                object_name, pose, seed, rollout.actions, rollout.touched, rollout.visited, rollout.touched_step
-            )
+            writer.add_rollout(rollout, paths[pose])
     for count in missing:
         grids = merged_grids([rollouts[pose] for pose in RECONSTRUCTED_POSES[count]])
         writer.add_reconstruction(object_name, count, seed, reconstructor.reconstruct(*grids))

@@ -232,11 +232,6 @@ def f_score(match: SurfaceMatch, distance: float) -> float:
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def surface_iou(touched: NDArray[np.bool_], surface: NDArray[np.bool_]) -> float:
-    """IoU of touched voxels with voxels that the true surface crosses, (32, 32, 32) each. Never called IoU alone."""
-    return iou(touched, surface)
-
-
 class TouchCoverage:
     """Which true surface samples have a touched voxel near, and since when.
 
@@ -293,7 +288,9 @@ class TouchCoverage:
 
 
 def surface_iou_curve(touched_step: NDArray, surface: NDArray[np.bool_], steps: int) -> NDArray[np.float64]:
-    """:func:`surface_iou` after 0, 1, ..., ``steps`` control steps: (steps + 1,).
+    """IoU of touched voxels with those that the true surface crosses, after 0, 1, ..., ``steps`` control steps: (steps + 1,).
+
+    Never called IoU alone.
 
     Args:
         touched_step: (32, 32, 32) integers: step (from 0) at which a voxel was first touched, -1 for never.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import igl
 import numpy as np
 import trimesh
 from numba import njit
@@ -69,6 +68,8 @@ def solid_in_mesh(mesh: trimesh.Trimesh, points: NDArray) -> NDArray[np.bool_]:
     that hang together and that no face comes near, one point decides for all, and only points in the other cells are looked
     at one by one.
     """
+    import igl  # only meshes need it
+
     points = np.asarray(points, dtype=np.float64)
     solid = np.zeros(len(points), dtype=bool)
     near = np.flatnonzero(((points >= mesh.bounds[0]) & (points <= mesh.bounds[1])).all(axis=1))

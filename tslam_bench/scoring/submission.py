@@ -16,26 +16,26 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from tslam_bench import grids
-from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PROTOCOL_POSES
+from tslam_bench.constants import PROTOCOL_POSES
+from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
+from tslam_bench.files import atomic_file, ensure_writable_directory, link_or_copy, write_json
 from tslam_bench.objects.splits import ALIASES, OBJECTS
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring.info import SubmissionInfo, parse_info
+from tslam_bench.scoring.rollout import OBJECT_NAME, Rollout, parse_rollout_file, rollout_file
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 from tslam_bench.scoring.untrusted_files import FileSource, open_source
 
 INFO_FILE: Final = "submission.json"
+ROLLOUTS: Final = "rollouts/"
 MAX_INFO_SIZE: Final = 64 * 2**10
 """Bytes of submission.json."""
 MAX_RESOLUTION: Final = 256
@@ -48,157 +48,76 @@ EXPLORATION_ORDER: Final = PROTOCOL_POSES[4] + tuple(k for k in PROTOCOL_POSES[8
 RECONSTRUCTED_POSES: Final[dict[int, tuple[int, ...]]] = {n: EXPLORATION_ORDER[:n] for n in (1, 2, 4, 8)}
 """Poses merged in each reconstruction, by their number; all four are required."""
 
-_ROLLOUT_ARRAYS: Final = {
-    "actions": Expected("float32", (HORIZON, NUM_JOINTS)),
-    "touched": Expected("uint8", (GRID_SIZE**3 // 8,)),
-    "visited": Expected("uint8", (GRID_SIZE**3 // 8,)),
-    "touched_step": Expected("int16", (GRID_SIZE,) * 3),
-}
 _RECONSTRUCTION_ARRAYS: Final = {
     "probability": Expected("float16", (None,) * 3, MAX_RESOLUTION),
     "interpolation": Expected("U", ()),
 }
-_ROLLOUT_NAME = re.compile(r"rollouts/([a-z0-9_]{1,64})/pose([0-7])_seed(0|[1-9][0-9]{0,9})\.npz")
-_RECONSTRUCTION_NAME = re.compile(r"reconstructions/([a-z0-9_]{1,64})_([1248])_seed(0|[1-9][0-9]{0,9})\.(npz|ply)")
+_RECONSTRUCTION_NAME: Final = re.compile(
+    rf"reconstructions/({OBJECT_NAME})_([1248])_seed(0|[1-9][0-9]{{0,9}})\.(npz|ply)"
+)
 
 Reconstruction = Volume | trimesh.Trimesh
 
 
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """One episode: one object, one pose, one seed. Grids are in the world frame of that pose.
-
-    Attributes:
-        actions: (200, 28) float32 in [-1, 1], one row per control step.
-        touched: (32, 32, 32) bool, voxels touched by the end.
-        visited: (32, 32, 32) bool, voxels visited by the end.
-        touched_step: (32, 32, 32) int16, control step (from 0) at which a voxel was first touched, -1 for never.
-
-    Raises:
-        InvalidInputError: shapes, data types or values are wrong, or ``touched_step`` and ``touched`` disagree.
-    """
-
-    actions: NDArray[np.float32]
-    touched: NDArray[np.bool_]
-    visited: NDArray[np.bool_]
-    touched_step: NDArray[np.int16]
-
-    def __post_init__(self) -> None:
-        grid = (GRID_SIZE,) * 3
-        for name, dtype, shape in (
-            ("actions", np.float32, (HORIZON, NUM_JOINTS)),
-            ("touched", np.bool_, grid),
-            ("visited", np.bool_, grid),
-            ("touched_step", np.int16, grid),
-        ):
-            value = np.asarray(getattr(self, name))
-            if value.shape != shape or value.dtype != dtype:
-                wanted = f"{shape} {np.dtype(dtype)}"
-                raise InvalidInputError(f"{name} is {value.shape} {value.dtype}; expected {wanted}")
-        if not np.isfinite(self.actions).all():
-            raise InvalidInputError("actions hold NaN or infinite values; store the actions that were executed")
-        if np.abs(self.actions).max() > 1:
-            raise InvalidInputError("actions leave [-1, 1]; clip them before they are executed and stored")
-        if ((self.touched_step < -1) | (self.touched_step >= HORIZON)).any():
-            raise InvalidInputError(f"touched_step holds values outside -1..{HORIZON - 1}")
-        if not np.array_equal(self.touched_step >= 0, self.touched):
-            raise InvalidInputError("touched_step and touched disagree; a voxel is touched iff its step is 0 or more")
-
-
 class Submission:
-    """A submission that was read and checked. Files are loaded when asked for.
+    """A submission whose files were all read, hashed and checked once. Can be sent to another process.
+
+    Files are read again when asked for, so that large submissions need little memory; one whose bytes are not those that
+    were hashed is refused.
 
     Attributes:
         info: contents of ``submission.json``.
         location: the path it was read from.
-        content_hash: SHA-256 over the names and bytes of all its files; the same for a folder and a zip of it; empty if
-            they were not checked.
+        content_hash: SHA-256 over the names and bytes of all its files; the same for a folder and a zip of it.
     """
 
-    def __init__(self, source: FileSource, info: SubmissionInfo, content_hash: str) -> None:
+    def __init__(self, source: FileSource, info: SubmissionInfo, digests: Mapping[str, str], content_hash: str) -> None:
+        """Args: digests: name -> SHA-256 of each of the files that were checked."""
         self.info = info
         self.location = source.location
         self.content_hash = content_hash
         self._source = source
+        self._digests = digests
+
+    def of_object(self, object_name: str) -> Submission:
+        """The same submission with the files of one object only: less to send to another process."""
+        own = {name: digest for name, digest in self._digests.items() if _object_of(name) == object_name}
+        return Submission(self._source.only(own), self.info, own, self.content_hash)
 
     def rollout(self, object_name: str, pose: int, seed: int) -> Rollout | None:
         """One episode, or None if the submission does not hold it."""
         name = rollout_name(object_name, pose, seed)
-        return self._read_rollout(name) if name in self._source.sizes else None
+        if name not in self._digests:
+            return None
+        return Rollout.from_bytes(self._read(name), (object_name, pose, seed), f"{self.location}: {name}")
 
     def reconstruction(self, object_name: str, count: int, seed: int) -> Reconstruction | None:
         """One reconstruction in the object frame, or None if the submission does not hold it."""
         for suffix in ("npz", "ply"):
             name = reconstruction_name(object_name, count, seed, suffix)
-            if name in self._source.sizes:
-                return self._read_reconstruction(name)
+            if name in self._digests:
+                return _reconstruction(self._read(name), name, self.location)
         return None
 
-    def check(self, objects: Collection[str]) -> None:
-        """Reads every file once. Raises InvalidInputError at the first that is not what it has to be."""
-        reconstructions: set[str] = set()
-        for name in sorted(self._source.sizes):
-            if name == INFO_FILE:
-                continue
-            rollout, reconstruction = _ROLLOUT_NAME.fullmatch(name), _RECONSTRUCTION_NAME.fullmatch(name)
-            match = rollout or reconstruction
-            if match is None:
-                raise self._refusal(name[:100], "not a file of a submission; see docs/submission.md for the names")
-            self._check_object(name, match[1], objects)
-            if int(match[3]) not in self.info.seeds:
-                raise self._refusal(
-                    name, f"seed {match[3]} is not among the seeds in {INFO_FILE}; list it or remove it"
-                )
-            if rollout:
-                self._read_rollout(name)
-            else:
-                if name[:-4] in reconstructions:
-                    raise self._refusal(name, "there is an .npz and a .ply of the same reconstruction; keep one")
-                reconstructions.add(name[:-4])
-                self._read_reconstruction(name)
+    def rollouts_hash(self, object_name: str, seed: int) -> str:
+        """SHA-256 over an object's rollouts, the same in every submission of one exploration; empty if there are none."""
+        names = [rollout_name(object_name, pose, seed) for pose in EXPLORATION_ORDER]
+        own = {name: self._digests[name] for name in names if name in self._digests}
+        return _combined(own) if own else ""
 
-    def _check_object(self, name: str, object_name: str, objects: Collection[str]) -> None:
-        if object_name in objects:
-            return
-        if object_name in ALIASES:
-            raise self._refusal(name, f"{object_name!r} is another name of {ALIASES[object_name]!r}; use that")
-        near = difflib.get_close_matches(object_name, objects, n=1)
-        remedy = f"did you mean {near[0]!r}?" if near else "tslam-bench assets list names them"
-        raise self._refusal(name, f"unknown object {object_name!r}; {remedy}")
-
-    def _read_rollout(self, name: str) -> Rollout:
-        arrays = read_npz(self._source.read(name), _ROLLOUT_ARRAYS, f"{self.location}: {name}")
-        try:
-            return Rollout(
-                actions=arrays["actions"],
-                touched=grids.unpack(arrays["touched"]),
-                visited=grids.unpack(arrays["visited"]),
-                touched_step=arrays["touched_step"],
-            )
-        except InvalidInputError as error:
-            raise self._refusal(name, str(error)) from error
-
-    def _read_reconstruction(self, name: str) -> Reconstruction:
+    def _read(self, name: str) -> bytes:
         data = self._source.read(name)
-        if name.endswith(".ply"):
-            return _read_ply(data, f"{self.location}: {name}")
-        arrays = read_npz(data, _RECONSTRUCTION_ARRAYS, f"{self.location}: {name}")
-        try:
-            return Volume(arrays["probability"].astype(np.float32), str(arrays["interpolation"]))  # type: ignore[arg-type]
-        except InvalidInputError as error:
-            raise self._refusal(name, str(error)) from error
-
-    def _refusal(self, name: str, reason: str) -> InvalidInputError:
-        return InvalidInputError(f"{self.location}: {name}: {reason}")
+        if hashlib.sha256(data).hexdigest() != self._digests[name]:
+            raise self._source.changed(name)
+        return data
 
 
-def read_submission(path: Path | str, objects: Collection[str] | None = None, check: bool = True) -> Submission:
-    """Reads and checks a submission, folder or zip archive, without trusting it.
+def read_submission(path: Path | str, objects: Collection[str] | None = None) -> Submission:
+    """Reads, hashes and checks every file of a submission, folder or zip archive, without trusting it.
 
     Args:
         path: folder or zip archive.
         objects: names that may occur; the test split by default.
-        check: read every file now; without it a damaged file is refused when it is asked for.
 
     Raises:
         InvalidInputError: one line that names the submission, the file in it, what is wrong and the remedy.
@@ -210,14 +129,70 @@ def read_submission(path: Path | str, objects: Collection[str] | None = None, ch
         )
     if source.sizes[INFO_FILE] > MAX_INFO_SIZE:
         raise InvalidInputError(f"{source.location}: {INFO_FILE} has more than {MAX_INFO_SIZE} bytes; shorten it")
+    data = source.read(INFO_FILE)
     try:
-        info = parse_info(source.read(INFO_FILE))
+        info = parse_info(data)
     except InvalidInputError as error:
         raise InvalidInputError(f"{source.location}: {INFO_FILE}: {error}") from error
-    submission = Submission(source, info, _content_hash(source) if check else "")
-    if check:
-        submission.check(OBJECTS.keys() if objects is None else objects)
-    return submission
+    _check_names(source, info, OBJECTS.keys() if objects is None else objects)
+    digests = {INFO_FILE: hashlib.sha256(data).hexdigest()}
+    for name in source.sizes:
+        if name != INFO_FILE:
+            data = source.read(name)
+            digests[name] = hashlib.sha256(data).hexdigest()
+            if (episode := _episode(name)) is not None:
+                Rollout.from_bytes(data, episode, f"{source.location}: {name}")
+            else:
+                _reconstruction(data, name, source.location)
+    return Submission(source, info, digests, _combined(digests))
+
+
+def _check_names(source: FileSource, info: SubmissionInfo, objects: Collection[str]) -> None:
+    """Raises InvalidInputError at the first name that a submission does not hold."""
+    reconstructions: set[str] = set()
+    for name in sorted(source.sizes):
+        if name == INFO_FILE:
+            continue
+        where = f"{source.location}: {name[:100]}"
+        episode, match = _episode(name), _RECONSTRUCTION_NAME.fullmatch(name)
+        if episode is not None:
+            object_name, seed = episode[0], episode[2]
+        elif match is not None:
+            object_name, seed = match[1], int(match[3])
+            if name[:-4] in reconstructions:
+                raise InvalidInputError(f"{where}: there is an .npz and a .ply of the same reconstruction; keep one")
+            reconstructions.add(name[:-4])
+        else:
+            raise InvalidInputError(f"{where}: not a file of a submission; see docs/submission.md for the names")
+        if object_name not in objects:
+            if object_name in ALIASES:
+                reason = f"{object_name!r} is another name of {ALIASES[object_name]!r}; use that"
+            else:
+                near = difflib.get_close_matches(object_name, objects, n=1)
+                remedy = f"did you mean {near[0]!r}?" if near else "tslam-bench assets list names them"
+                reason = f"unknown object {object_name!r}; {remedy}"
+            raise InvalidInputError(f"{where}: {reason}")
+        if seed not in info.seeds:
+            raise InvalidInputError(f"{where}: seed {seed} is not among the seeds in {INFO_FILE}; list it or remove it")
+
+
+def _episode(name: str) -> Episode | None:
+    """The episode whose rollout the file ``name`` holds, or None."""
+    return parse_rollout_file(name.removeprefix(ROLLOUTS)) if name.startswith(ROLLOUTS) else None
+
+
+def _object_of(name: str) -> str | None:
+    """The object that the file ``name`` is of, or None."""
+    match = _RECONSTRUCTION_NAME.fullmatch(name)
+    return match[1] if match else (_episode(name) or (None,))[0]
+
+
+def _combined(digests: Mapping[str, str]) -> str:
+    """SHA-256 over names and the SHA-256 of what they name."""
+    whole = hashlib.sha256()
+    for name in sorted(digests):
+        whole.update(json.dumps([name, digests[name]]).encode())
+    return whole.hexdigest()
 
 
 class SubmissionWriter:
@@ -262,29 +237,19 @@ class SubmissionWriter:
         names = (reconstruction_name(object_name, count, seed, suffix) for suffix in ("npz", "ply"))
         return any((self.directory / name).is_file() for name in names)
 
-    def add_rollout(
-        self,
-        object_name: str,
-        pose: int,
-        seed: int,
-        actions: NDArray[np.float32],
-        touched: NDArray[np.bool_],
-        visited: NDArray[np.bool_],
-        touched_step: NDArray[np.int16],
-    ) -> None:
-        """Writes one episode; arguments as in :class:`Rollout`, grids in the world frame of ``pose``."""
-        name = self._checked(rollout_name(object_name, pose, seed), _ROLLOUT_NAME, seed)
-        try:
-            rollout = Rollout(np.asarray(actions), np.asarray(touched), np.asarray(visited), np.asarray(touched_step))
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{name}: {error}") from error
-        self._write_npz(
-            name,
-            actions=rollout.actions,
-            touched=grids.pack(rollout.touched),
-            visited=grids.pack(rollout.visited),
-            touched_step=rollout.touched_step,
-        )
+    def add_rollout(self, rollout: Rollout, stored: Path | None = None) -> None:
+        """Adds one episode.
+
+        Args:
+            stored: the file that it was saved to or loaded from, if any. It is not written again: the submission gets
+                a hard link to it, or a copy where the file system has no links.
+        """
+        name = rollout_name(rollout.object, rollout.pose, rollout.seed)
+        self._check_seed(name, rollout.seed)
+        if stored is not None:
+            link_or_copy(stored, self.directory / name)
+        else:
+            rollout.save(self.directory / ROLLOUTS)
 
     def add_reconstruction(self, object_name: str, count: int, seed: int, reconstruction: Reconstruction) -> None:
         """Writes one reconstruction in the object frame: a volume as float16, or a watertight mesh in metres.
@@ -293,15 +258,16 @@ class SubmissionWriter:
             count: number of merged poses: 1, 2, 4 or 8.
         """
         suffix = "npz" if isinstance(reconstruction, Volume) else "ply"
-        name = self._checked(reconstruction_name(object_name, count, seed, suffix), _RECONSTRUCTION_NAME, seed)
+        name = reconstruction_name(object_name, count, seed, suffix)
+        if not _RECONSTRUCTION_NAME.fullmatch(name):
+            raise InvalidInputError(f"{name}: not a file of a submission; check object, number of poses, and seed")
+        self._check_seed(name, seed)
         if isinstance(reconstruction, Volume):
             if reconstruction.resolution > MAX_RESOLUTION:
                 raise InvalidInputError(f"{name}: resolution {reconstruction.resolution}; at most {MAX_RESOLUTION}")
-            self._write_npz(
-                name,
-                probability=reconstruction.probability.astype(np.float16),
-                interpolation=np.array(reconstruction.interpolation),
-            )
+            half = reconstruction.probability.astype(np.float16)
+            with atomic_file(self.directory / name) as temporary, temporary.open("wb") as stream:
+                np.savez_compressed(stream, probability=half, interpolation=np.array(reconstruction.interpolation))
             return
         if not isinstance(reconstruction, trimesh.Trimesh):
             raise InvalidInputError(f"{name}: {type(reconstruction).__name__}; give a Volume or a trimesh.Trimesh")
@@ -323,23 +289,14 @@ class SubmissionWriter:
         if kind is None:
             self.close()
 
-    def _checked(self, name: str, pattern: re.Pattern[str], seed: int) -> str:
-        if not pattern.fullmatch(name):
-            raise InvalidInputError(
-                f"{name}: not a file of a submission; check object, pose or number of poses, and seed"
-            )
+    def _check_seed(self, name: str, seed: int) -> None:
         if seed not in self.info.seeds:
             raise InvalidInputError(f"{name}: seed {seed} is not among the submission's seeds {list(self.info.seeds)}")
-        return name
-
-    def _write_npz(self, name: str, **arrays: NDArray) -> None:
-        with atomic_file(self.directory / name) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
 def rollout_name(object_name: str, pose: int, seed: int) -> str:
     """Name of a rollout inside a submission."""
-    return f"rollouts/{object_name}/pose{pose}_seed{seed}.npz"
+    return ROLLOUTS + rollout_file(object_name, pose, seed)
 
 
 def reconstruction_name(object_name: str, count: int, seed: int, suffix: str) -> str:
@@ -347,11 +304,15 @@ def reconstruction_name(object_name: str, count: int, seed: int, suffix: str) ->
     return f"reconstructions/{object_name}_{count}_seed{seed}.{suffix}"
 
 
-def _content_hash(source: FileSource) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(source.sizes):
-        digest.update(json.dumps([name, hashlib.sha256(source.read(name)).hexdigest()]).encode())
-    return digest.hexdigest()
+def _reconstruction(data: bytes, name: str, location: str) -> Reconstruction:
+    where = f"{location}: {name}"
+    if name.endswith(".ply"):
+        return _read_ply(data, where)
+    arrays = read_npz(data, _RECONSTRUCTION_ARRAYS, where)
+    try:
+        return Volume(arrays["probability"].astype(np.float32), str(arrays["interpolation"]))  # type: ignore[arg-type]
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from error
 
 
 def _read_ply(data: bytes, where: str) -> trimesh.Trimesh:

@@ -5,12 +5,17 @@ Nothing is ever extracted. Names are checked before anything is opened, sizes be
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import functools
 import os
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Final
+from typing import IO, Any, Final
 
 from tslam_bench.errors import InvalidInputError
 
@@ -25,11 +30,12 @@ MAX_COMPRESSION_RATIO: Final = 100
 RATIO_FREE_SIZE: Final = 2**20
 """Bytes below which the compression ratio of an entry is not looked at: 1 MiB."""
 
+_AS_IT_IS: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _IGNORED_NAMES = ("readme", "readme.md", "readme.txt", "license", "license.txt", "license.md")
 
 
 class FileSource:
-    """Names and bytes of the regular files of a submission.
+    """Names and bytes of the regular files of a submission. Can be sent to another process.
 
     Attributes:
         location: the path as given, for messages.
@@ -49,8 +55,29 @@ class FileSource:
             raise InvalidInputError(f"{location}: {total} bytes uncompressed; at most {MAX_TOTAL_SIZE} are read")
         self.sizes = {name: size for name, size in sizes.items() if not _ignored(name)}
 
+    def only(self, names: Iterable[str]) -> FileSource:
+        """The same source with some of its files."""
+        part = copy.copy(self)
+        part.sizes = {name: self.sizes[name] for name in names}
+        return part
+
     def read(self, name: str) -> bytes:
-        """Bytes of one listed file."""
+        """Bytes of one listed file.
+
+        Raises:
+            InvalidInputError: it cannot be read, or has another size than when the submission was opened.
+        """
+        with self._open(name) as stream:
+            data = stream.read(self.sizes[name] + 1)
+        if len(data) != self.sizes[name]:
+            raise self.changed(name)
+        return data
+
+    def changed(self, name: str) -> InvalidInputError:
+        """The refusal of a file that is not what it was when the submission was opened."""
+        return InvalidInputError(f"{self.location}: {name} changed while it was read; start again when nothing writes")
+
+    def _open(self, name: str) -> AbstractContextManager[IO[bytes]]:
         raise NotImplementedError
 
 
@@ -80,11 +107,14 @@ class FolderSource(FileSource):
                     raise InvalidInputError(f"{folder}: more than {MAX_FILES} files; is this a submission folder?")
         super().__init__(str(folder), sizes)
 
-    def read(self, name: str) -> bytes:
-        """Bytes of one listed file."""
+    @contextlib.contextmanager
+    def _open(self, name: str) -> Iterator[IO[bytes]]:
         try:
-            with (self._folder / name).open("rb") as stream:
-                return stream.read(MAX_FILE_SIZE + 1)
+            # A link or a pipe that has taken the file's place is neither followed nor waited for.
+            with open(self._folder / name, "rb", opener=lambda path, flags: os.open(path, flags | _AS_IT_IS)) as stream:
+                if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                    raise self.changed(name)
+                yield stream
         except OSError as error:
             raise InvalidInputError(f"{self.location}: {name} cannot be read ({error.strerror})") from error
 
@@ -93,26 +123,41 @@ class ZipSource(FileSource):
     """A submission in a zip archive: its files at the top, or in one folder at the top."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            self._archive = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise InvalidInputError(f"{path}: not a readable zip archive ({error}); pack it again") from error
-        entries: dict[str, zipfile.ZipInfo] = {}
+        self._path = path
+        sizes: dict[str, int] = {}
         for entry in self._archive.infolist():
             if not entry.is_dir():
                 _check_entry(str(path), entry)
-                if entry.filename in entries:
+                if entry.filename in sizes:
                     raise InvalidInputError(f"{path}: {entry.filename} is in the archive twice; pack it again")
-                entries[entry.filename] = entry
-        prefix = _common_folder([name for name in entries if not name.startswith("__MACOSX/")])
-        self._entries = {name.removeprefix(prefix): entry for name, entry in entries.items()}
-        super().__init__(str(path), {name: entry.file_size for name, entry in self._entries.items()})
+                sizes[entry.filename] = entry.file_size
+        self._prefix = _common_folder([name for name in sizes if not name.startswith("__MACOSX/")])
+        super().__init__(str(path), {name.removeprefix(self._prefix): size for name, size in sizes.items()})
 
-    def read(self, name: str) -> bytes:
-        """Bytes of one listed file; zipfile stops at the declared size and checks the CRC."""
+    @functools.cached_property
+    def _archive(self) -> zipfile.ZipFile:
         try:
-            return self._archive.read(self._entries[name])
-        except (OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+            return zipfile.ZipFile(self._path)
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise InvalidInputError(f"{self._path}: not a readable zip archive ({error}); pack it again") from error
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_archive"}
+
+    @contextlib.contextmanager
+    def _open(self, name: str) -> Iterator[IO[bytes]]:
+        try:
+            with self._archive.open(self._prefix + name) as stream:
+                yield stream  # it stops at the declared size and checks the CRC
+        except (
+            OSError,
+            EOFError,
+            KeyError,
+            zipfile.BadZipFile,
+            zlib.error,
+            NotImplementedError,
+            RuntimeError,
+        ) as error:
             raise InvalidInputError(f"{self.location}: {name} is damaged ({error}); pack it again") from error
 
 

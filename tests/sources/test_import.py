@@ -21,6 +21,7 @@ from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.objects import splits, store
 from tslam_bench.objects.hand import hand_directory, load_hand
+from tslam_bench.preparation.repair import repair
 from tslam_bench.preparation.schedule import remove_unlisted
 from tslam_bench.preparation.workers import WorkerPool
 from tslam_bench.sources import meshfiles
@@ -259,6 +260,15 @@ def test_mutants_are_accepted_whole_or_refused_with_a_reason(tmp_path):
     }
     for kind, word in words.items():
         assert outcomes[kind][0] == "rejected" and word in outcomes[kind][1], (kind, outcomes[kind])
+
+
+def test_slivers_that_cancel_out_are_refused():
+    """With one vertex far out and the rest scaled to nothing, two slivers are left whose union is empty."""
+    damage = mesh_mutations.GEOMETRY["vertex far out"]
+    mesh = damage(generate.draw("mug", 0)[0], np.random.Generator(np.random.PCG64(37)))
+    mesh, _ = scale_to_hand(mesh._replace(vertices=mesh.vertices.astype(np.float32).astype(float)), "mug")
+    with pytest.raises(AssetError, match="encloses no volume"):
+        repair(mesh)
 
 
 @pytest.mark.slow

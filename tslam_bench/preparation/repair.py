@@ -98,10 +98,10 @@ def largest_part(solid: manifold3d.Manifold) -> tuple[manifold3d.Manifold, float
     parts = solid.decompose()
     shells = [part for part in parts if part.volume() > 0]
     voids = [part for part in parts if part.volume() < 0]
-    if not shells:
-        raise AssetError("the mesh encloses no volume")
     if len(shells) > 1:
         shells = [part for part in union(shells).decompose() if part.volume() > 0]
+    if not shells:
+        raise AssetError("the mesh encloses no volume")
     total = sum(part.volume() for part in shells)
     best = max(shells, key=lambda part: part.volume())
     share = float(best.volume() / total)

@@ -24,6 +24,24 @@ from tslam_bench.hand_constants import SKIN_LINKS
 
 TARGET = Path(__file__).parent / "environment.md"
 
+VECTOR = """\
+`gymnasium.make_vec("TactileSLAM-v0", num_envs=16, split="train")` and `tslam_bench.make_vec("TactileSLAM-v0", 16, split="train")`
+are the same vector environment, with the same arguments. Gymnasium's modes `sync` and `async` are not meant for it.
+
+On the CPU, results have the form of `gymnasium.vector.SyncVectorEnv` with autoreset `SAME_STEP`. Where an episode ends,
+observation and `info` are the next episode's first. `info["final_obs"]` is an array of objects: an environment's true last
+observation, a dict of arrays without the batch axis, or None. `info["final_info"]` holds the last step's numbers. Each entry of
+an info has a mask (`_final_obs`, `_new_touched`). A `reset_mask` needs one full reset before it.
+
+`RecordEpisodeStatistics` and Gymnasium's other vector wrappers of actions, rewards and infos take it. Its wrappers of
+observations, and its conversion to torch, take no environment that resets in the same step.
+
+`processes=0` steps in the caller's own process, for notebooks, daemonic pools and debuggers. It needs no
+`if __name__ == "__main__":`, and an error has its own traceback. The number of processes does not change a bit.
+
+On CUDA, values are torch tensors on the device. `info["final_obs"]` is an array of objects there too, with tensors in its
+observations. Gymnasium's wrappers compute with numpy and do not take these results."""
+
 
 @dataclass(frozen=True)
 class Config:
@@ -63,6 +81,8 @@ def page() -> str:
         f"```text\n{manual}\n```",
         f"## `{TABLETOP_ID}`",
         f"```text\n{tabletop_manual}\n```",
+        "## Many environments",
+        VECTOR,
         "## Observations",
         "Per environment; every value is batched `(num_envs, ...)`. `touch` follows the order of the skin links: "
         + ", ".join(f"`{name}`" for name in SKIN_LINKS)

@@ -147,14 +147,15 @@ class Registry(Generic[S]):
         Raises:
             InvalidInputError: there is no such class, or an argument that JSON cannot hold.
         """
-        for key, value in arguments.items():
-            if not _is_json(value):
-                raise InvalidInputError(
-                    f"{self.label(spec)}: argument {key!r} must be plain data, to be recorded as JSON"
-                )
+        try:
+            recorded = json.loads(json.dumps(dict(arguments), allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"{self.label(spec)}: its arguments cannot be recorded as JSON ({error})"
+            ) from error
         return {
             self.kind: spec.reference or spec.id,
-            "arguments": dict(arguments),
+            "arguments": recorded,
             "model_sha256": None if model is None else content_sha256(model),
             "code_sha256": None if spec.id in self._built_in else self._code_sha256(spec),
         }
@@ -282,10 +283,10 @@ def content_sha256(path: Path) -> str:
 
 
 def _file_module(path: Path, label: str) -> ModuleType:
-    """The module of a file that lies anywhere; executed once."""
+    """The module of a file that lies anywhere; executed once, and again after a change."""
     if not path.is_file():
         raise InvalidInputError(f"{label}: there is no file {path}")
-    name = f"{path.stem}_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]}"
+    name = f"{path.stem}_{hashlib.sha256(f'{path.resolve()} {sha256_file(path)}'.encode()).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None and spec.loader is not None
@@ -312,10 +313,3 @@ def _check_arguments(factory: Callable[..., Any], given: Mapping[str, Any], labe
         if "model" in given and "model" not in accepts:
             raise InvalidInputError(f"{label}: takes no model; leave {given['model']} out") from None
         raise InvalidInputError(f"{label}: {error}; its arguments are {signature}") from None
-
-
-def _is_json(value: Any) -> bool:
-    try:
-        return json.loads(json.dumps(value, allow_nan=False)) == (list(value) if isinstance(value, tuple) else value)
-    except (TypeError, ValueError):
-        return False

@@ -24,7 +24,7 @@ from tslam_bench.evaluation.policies import get_baseline, list_baselines, make_b
 from tslam_bench.evaluation.policy import CheckedPolicy
 from tslam_bench.files import CACHE_VARIABLE, sha256_file
 from tslam_bench.grids import world_to_object
-from tslam_bench.plugins import content_sha256, identifier_of, parse_arguments
+from tslam_bench.plugins import content_sha256, identifier_of, load, parse_arguments
 from tslam_bench.reconstruction.hull import HullReconstructor
 from tslam_bench.reconstruction.registry import get_reconstructor, list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.volume import Volume
@@ -499,6 +499,15 @@ def test_arguments_and_ids() -> None:
     assert get_baseline("a:B").reference == "a:B" and get_baseline(Answers).id.endswith("test_doors.answers")
 
 
+def test_a_file_is_executed_once_and_again_after_a_change(tmp_path: Path) -> None:
+    file = tmp_path / "counted.py"
+    file.write_text("class A: value = 1\n")
+    first = load(f"{file}:A", "policy")
+    assert load(f"{file}:A", "policy") is first
+    file.write_text("class A: value = 2\n")
+    assert (first.value, load(f"{file}:A", "policy").value) == (1, 2)
+
+
 def test_a_models_hash_is_that_of_names_and_contents(tmp_path: Path) -> None:
     for name, text in (("a/x", "1"), ("a/y/z", "2"), ("b/x", "1"), ("b/y/z", "2"), ("c/x", "1"), ("c/z", "2")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -510,7 +519,7 @@ def test_a_models_hash_is_that_of_names_and_contents(tmp_path: Path) -> None:
 
 
 def test_arguments_have_to_be_recordable(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="argument 'answer' must be plain data"):
+    with pytest.raises(InvalidInputError, match=r"arguments cannot be recorded as JSON .*ndarray"):
         tslam_bench.evaluate(Answers, ("none",), ("phone",), tmp_path, arguments={"answer": np.zeros(3)})
     with pytest.raises(UserCodeError, match="making it raised"):
         make_baseline(lambda: 1 / 0)

@@ -50,8 +50,7 @@ def stage_costs(num_envs: int, settings: BatchSettings, steps: int = HORIZON) ->
     timed(batch, "_gather", "reading state")
     timed(batch._sensing, "step", "sensing")
     timed(batch._sensing, "link_touch", "sensing")
-    if batch._rewards is not None:
-        timed(batch._rewards, "step", "rewards")
+    timed(batch._rewards, "step", "rewards")
     timed(batch, "_start_anew", "resets")
 
     generator = np.random.Generator(np.random.PCG64(0))

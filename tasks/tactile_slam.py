@@ -194,14 +194,14 @@ class TactileSLAMEnv(WholeState):
         super()._load_agent(options, AdroitHand.base_pose())
 
     def _load_scene(self, options: dict) -> None:
-        skin, mode = build_skin(load_hand().shapes), self._reward_mode
+        skin = build_skin(load_hand().shapes)
         backend = TorchBackend(self.device) if self.uses_tensors else NumpyBackend()
         self._sensing: Any = (
             TorchSensing(self.num_envs, skin, self.device)
             if self.uses_tensors
             else CompiledSensing(self.num_envs, skin)
         )
-        self._rewards = None if mode == "none" else Rewards(mode, self.num_envs, backend)
+        self._rewards = Rewards(self._reward_mode, self.num_envs, backend)
         render = self.scene.can_render()
         if self.gpu_sim_enabled:
             self._load_gpu_objects(options, render)  # GPU only
@@ -273,8 +273,7 @@ class TactileSLAMEnv(WholeState):
         for env, start in zip(envs, starts, strict=True):
             self.object_name[env], self.pose[env] = start.prepared.name, start.pose
             self._sensing.set_object(env, start.prepared.name, start.prepared.field, start.pose)
-            if self._rewards is not None:
-                self._rewards.set_object(env, start.prepared, start.pose)
+            self._rewards.set_object(env, start.prepared, start.pose)
         if self.gpu_sim_enabled:
             self._place_on_gpu(env_idx, starts)  # GPU only
         else:
@@ -283,8 +282,7 @@ class TactileSLAMEnv(WholeState):
             self.scene.sub_scenes[0], self.scene.px = self.hand.scene, self.hand.system
             self._register_object([self.hand.object_body])
         self._sensing.begin(envs)
-        if self._rewards is not None:
-            self._rewards.begin(envs)
+        self._rewards.begin(envs)
         self._contacts: Contacts | None = None
         self._reward = None
 
@@ -329,8 +327,7 @@ class TactileSLAMEnv(WholeState):
             self._contacts = self._sensing.step(self.agent.device_skin_matrices(), step)
         else:
             self._contacts = self._sensing.step(self.hand.skin_matrices(), step.numpy())
-        if self._rewards is not None:
-            self._reward = self._rewards.step(self._contacts)
+        self._reward = self._rewards.step(self._contacts)
         return action
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:

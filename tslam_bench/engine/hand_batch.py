@@ -92,7 +92,7 @@ class HandBatch:
         self._scenes = settings.scenes(hand.urdf, settings.physics, table, num_envs)
         self._sensing = CompiledSensing(num_envs, build_skin(hand.shapes), arrays["occupancy"])
         self._targets = DriveTargets(settings.control_mode, backend, settings.physics.step_limit)
-        self._rewards = Rewards(settings.reward_mode, num_envs, backend) if settings.reward_mode != "none" else None
+        self._rewards = Rewards(settings.reward_mode, num_envs, backend)
         self._rngs: list[np.random.RandomState | None] = [None] * num_envs
         self._qpos = np.zeros((num_envs, NUM_JOINTS), dtype=np.float32)
         self._qvel = np.zeros((num_envs, NUM_JOINTS), dtype=np.float32)
@@ -127,12 +127,10 @@ class HandBatch:
             self.object_name[env], self.pose[env] = start.prepared.name, start.pose
             self._scenes[env].begin(start)
             self._sensing.set_object(env, start.prepared.name, start.prepared.field, start.pose)
-            if self._rewards is not None:
-                self._rewards.set_object(env, start.prepared, start.pose)
+            self._rewards.set_object(env, start.prepared, start.pose)
         self._read(envs)
         self._sensing.begin(envs)
-        if self._rewards is not None:
-            self._rewards.begin(envs)
+        self._rewards.begin(envs)
         felt = self._sensing.touches(self._links)[list(envs)].any(1)
         if felt.any():
             name = self.object_name[envs[int(np.flatnonzero(felt)[0])]]
@@ -164,7 +162,7 @@ class HandBatch:
         self._gather()
         contacts = self._sensing.step(self._links, arrays["elapsed_steps"])
         arrays["elapsed_steps"][:] += 1
-        arrays["reward"][:] = 0.0 if self._rewards is None else self._rewards.step(contacts)
+        arrays["reward"][:] = self._rewards.step(contacts)
         arrays["new_touched"][:] = contacts.new_touched
         arrays["new_visited"][:] = contacts.new_visited
         arrays["touch"][:] = self._sensing.link_touch()

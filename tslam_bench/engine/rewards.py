@@ -46,7 +46,7 @@ class Rewards:
     """Computes one reward mode for E environments.
 
     Args:
-        mode: one of ``tslam_bench.constants.REWARD_MODES``.
+        mode: one of ``tslam_bench.constants.REWARD_MODES``, or ``none``, whose rewards are 0.
         num_envs: E.
         backend: numpy or torch.
     """
@@ -77,6 +77,8 @@ class Rewards:
 
     def step(self, contacts: Contacts) -> Array:
         """(E,) float32 reward of one control step."""
+        if self.mode == "none":
+            return self.backend.full((self.num_envs,), 0, np.float32)
         coverage = COVERAGE_WEIGHT * self._float(contacts.new_visited)
         if self.mode == "no_discovery":
             return coverage

@@ -16,6 +16,7 @@ from tslam_bench.engine.hand_scene import HandScene
 from tslam_bench.engine.rewards import Rewards
 from tslam_bench.engine.sensing import Sensing
 from tslam_bench.engine.starts import Start, StartSampler
+from tslam_bench.errors import InvalidInputError
 
 NAME_BYTES: Final = 64
 """Longest name of an object, in UTF-8."""
@@ -35,7 +36,7 @@ class WholeState(BaseEnv):
     """The simulated hand, CPU simulation."""
     _starts: StartSampler
     _sensing: Sensing
-    _rewards: Rewards | None
+    _rewards: Rewards
     _start: Start
     _past_targets: list[NDArray[np.float32]]
     """(28,) drive targets of every control step of the episode, CPU simulation."""
@@ -62,7 +63,7 @@ class WholeState(BaseEnv):
         ours = {
             "episode": episode,
             "sensing": self._sensing.state(),
-            "reward": {} if self._rewards is None else self._rewards.state(),
+            "reward": self._rewards.state(),
             "generators": generators,
         }
         return {**super().get_state_dict(), **common.to_tensor(ours, device=self.device)}
@@ -73,7 +74,8 @@ class WholeState(BaseEnv):
         A state whose hand was moved by other means than actions is set as it is; bits are then not promised.
 
         Raises:
-            InvalidInputError: a state of another reward mode, or of an object that is unknown here.
+            InvalidInputError: a state of another reward mode, of an object that is unknown here, or on a GPU of another object
+            than the scene's.
         """
         if "episode" not in state:  # ManiSkill's own: where things are
             super().set_state_dict(state, env_idx)
@@ -82,12 +84,16 @@ class WholeState(BaseEnv):
         envs, episode = env_idx.tolist(), common.to_numpy(state["episode"])
         starts = []
         for row, name in enumerate(names_from_array(episode["object"])):
+            if self.gpu_sim_enabled and name != self.object_name[envs[row]]:  # GPU only
+                raise InvalidInputError(f"state: of {name!r}; a GPU scene keeps {self.object_name[envs[row]]!r}")
             qpos = episode["start"][row] if "start" in episode else np.zeros(NUM_JOINTS, dtype=np.float32)
             starts.append(Start(self._starts.load(name), int(episode["pose"][row]), qpos))
+        kept, self.scene._reset_mask = self.scene._reset_mask, torch.zeros_like(self.scene._reset_mask)
+        self.scene._reset_mask[env_idx] = True  # what ManiSkill's setters move
         self._begin(env_idx, starts)
+        self.scene._reset_mask = kept
         self._sensing.set_state(envs, state["sensing"])
-        if self._rewards is not None:
-            self._rewards.set_state(envs, state["reward"])
+        self._rewards.set_state(envs, state["reward"])
         self._elapsed_steps[env_idx] = torch.as_tensor(state["episode"]["elapsed_steps"], device=self.device)
         for name, generators in (("main", self._batched_main_rng), ("episode", self._batched_episode_rng)):
             saved = common.to_numpy(state["generators"][name])

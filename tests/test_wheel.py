@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tslam_bench.extras import EXTRAS
+
 ROOT = Path(__file__).parents[1]
 EPISODE = """
 import gymnasium as gym, numpy as np, tslam_bench
@@ -81,3 +83,23 @@ def test_an_installed_wheel_evaluates_and_scores(installed: Path, tmp_path: Path
     assert "mug" in run(command, "score", submission, "--objects", "mug", folder=tmp_path)
     run(command, "leaderboard", submission, "--output", tmp_path / "page", folder=tmp_path)
     assert (tmp_path / "page" / "index.html").stat().st_size > 10_000
+
+
+def test_the_core_scores_without_simulator_and_torch(wheel: Path, tmp_path: Path) -> None:
+    """A virtual environment that holds the wheel and what its core requires, nothing else."""
+    run(sys.executable, "-m", "venv", tmp_path / "venv", folder=tmp_path)
+    python = tmp_path / "venv" / "bin" / "python"
+    options = ["--quiet", "--constraint", ROOT / "constraints.txt"]
+    run(python, "-m", "pip", "install", *options, wheel, folder=tmp_path)
+    absent = [module for modules in EXTRAS.values() for module in modules]
+    find = f"import importlib.util as u; print([m for m in {absent} if u.find_spec(m)])"
+    assert run(python, "-c", find, folder=tmp_path).strip() == "[]"
+    example = ROOT / "examples" / "6_score_a_submission.py"
+    assert "IoU area" in run(python, example, "--objects", "mug", "--output", "balls", folder=tmp_path)
+    command = tmp_path / "venv" / "bin" / "tslam-bench"
+    run(command, "leaderboard", "balls", "--output", "page", folder=tmp_path)
+    assert (tmp_path / "page" / "index.html").stat().st_size > 10_000
+    for arguments in (["evaluate", "--policy", "random"], ["assets", "prepare", "--hand"]):
+        done = subprocess.run([command, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 2 and "pip install 'tslam-bench[" in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1

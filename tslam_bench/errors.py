@@ -13,5 +13,9 @@ class AssetError(BenchmarkError, RuntimeError):
     """Asset data is missing, corrupt, or cannot be fetched or written."""
 
 
+class MissingPackageError(BenchmarkError, ImportError):
+    """A package of an extra that is not installed is needed."""
+
+
 class UserCodeError(BenchmarkError, RuntimeError):
     """A policy or reconstructor of the user's own raised something, which is the cause of this error."""

@@ -11,11 +11,13 @@ import gymnasium.vector
 
 from tslam_bench.constants import ENVIRONMENT_ID
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.extras import named_extra
 from tslam_bench.variants import ENVIRONMENT_IDS, get_variant
 
 _TASKS = ("tslam_bench.tasks.tactile_slam", "tslam_bench.tasks.tabletop")
 
 
+@named_extra()
 def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     """Makes the unwrapped environment; what ``gymnasium.make`` calls."""
     from mani_skill.utils import registration
@@ -26,6 +28,7 @@ def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     return registration.make(environment_id, **kwargs)
 
 
+@named_extra()
 def make_vec(
     environment_id: str = ENVIRONMENT_ID,
     num_envs: int = 16,
@@ -69,6 +72,7 @@ def make_vec(
     Raises:
         InvalidInputError: unknown id, device, object, pose or mode, a bad action_repeat; CUDA asked for where there is none.
         AssetError: objects or the hand are not prepared.
+        MissingPackageError: the extra ``sim`` is not installed.
     """
     get_variant(environment_id)
     if device not in ("auto", "cpu", "cuda"):

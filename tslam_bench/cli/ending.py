@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tslam_bench.errors import BenchmarkError, UserCodeError
+from tslam_bench.extras import named_extra
 
 _PACKAGE = str(Path(__file__).parents[1])
 
@@ -20,7 +21,8 @@ def one_line_errors(program: str) -> Iterator[None]:
     line), 130 (interrupted) or 141 (the reader of a pipe has gone).
     """
     try:
-        yield
+        with named_extra():
+            yield
     except UserCodeError as error:
         _print_cause(error)
         print(f"{program}: {error}", file=sys.stderr)

@@ -35,7 +35,8 @@ def main(generations: int = 5, num_envs: int = 32, targets: int = 10, object: st
         touched = np.zeros(num_envs, dtype=np.int64)
         for step in range(targets):
             observation, reward, terminated, truncated, info = envs.step(candidates[:, step])
-            touched += info["new_touched"]
+            # All episodes end together here; then `info` is that of the next ones, and `final_info` that of this step.
+            touched += info.get("final_info", info)["new_touched"]
         best = candidates[np.argsort(touched)[-num_envs // 4 :]]
         mean, deviation = best.mean(axis=0), best.std(axis=0) + 0.05
         print(f"generation {generation}: mean {touched.mean():.0f}, best {touched.max()} voxels touched")

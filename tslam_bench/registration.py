@@ -20,7 +20,9 @@ _TASKS = ("tslam_bench.tasks.tactile_slam", "tslam_bench.tasks.tabletop")
 @named_extra()
 def make_environment(environment_id: str, **kwargs: Any) -> gymnasium.Env:
     """Makes the unwrapped environment; what ``gymnasium.make`` calls."""
-    from mani_skill.utils import registration
+    import tslam_bench.engine  # noqa: F401  (before the simulator: quiet about a missing Vulkan)
+
+    from mani_skill.utils import registration  # isort: skip
 
     for module in _TASKS:
         importlib.import_module(module)  # registers with ManiSkill

@@ -7,8 +7,8 @@ from typing import Final
 
 from tslam_bench.errors import InvalidInputError
 
-HAND_SHAPES: Final = 20
-"""Collision shapes of the hand."""
+HAND_SHAPES: Final = 37
+"""Collision shapes of the hand: capsules, the spheres in their far ends, boxes."""
 CONTACTS_PER_PAIR: Final = 6
 """Contact points that PhysX keeps for one pair of convex shapes, at most."""
 TOUCHING_PAIRS: Final = 64

@@ -27,7 +27,7 @@ class WholeState(BaseEnv):
 
     PhysX does not show its contact caches, and an articulation whose positions are set goes on differently in the last bits. So
     on the CPU a state holds the drive targets since the episode's start, and restoring replays them in a new physics system: the
-    same bits, at about 0.3 ms for each control step.
+    same bits, at about 0.2 ms for each control step.
     """
 
     object_name: list[str]

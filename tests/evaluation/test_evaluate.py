@@ -29,7 +29,7 @@ from tslam_bench.evaluation.evaluate import (
 )
 from tslam_bench.evaluation.observations import observation_to_numpy, to_numpy
 from tslam_bench.evaluation.policies import make_baseline
-from tslam_bench.evaluation.policy import Baseline
+from tslam_bench.evaluation.policy import Policy
 from tslam_bench.evaluation.rollouts import roll_out_batch
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.grids import voxel_centres, world_to_object
@@ -48,7 +48,7 @@ def cache(tmp_path_factory):
         yield folder
 
 
-def play(env: gym.Env, policy: Baseline, name: str, pose: int, seed: int, salt: str) -> Rollout:
+def play(env: gym.Env, policy: Policy, name: str, pose: int, seed: int, salt: str) -> Rollout:
     """One episode in an environment of ``gymnasium.make``."""
     policy.reset(1, [policy_seed(salt, (name, pose, seed))])
     observation, _ = env.reset(seed=episode_seed(pose, seed), options={"object": name, "pose": pose})

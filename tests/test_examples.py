@@ -79,9 +79,9 @@ def test_train_on_many_environments(tmp_path: Path) -> None:
 
 
 def test_score_a_submission(tmp_path: Path) -> None:
-    output = run("6_score_a_submission.py", "--objects", "spheremedium", "mug", "--output", "balls", folder=tmp_path)
+    output = run("6_score_a_submission.py", "--objects", "cubemedium", "mug", "--output", "balls", folder=tmp_path)
     values = {name: float(iou) for name, iou in re.findall(r"(\w+): IoU ([\d.]+)", output)}
-    assert values["spheremedium"] > values["mug"] > 0
+    assert values["cubemedium"] > values["mug"] > 0
 
 
 def test_your_own_meshes(tmp_path: Path) -> None:

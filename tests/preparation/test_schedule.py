@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tslam_bench.cli import assets
+from tslam_bench.cli import main
 from tslam_bench.constants import SIGNED_DISTANCE_TOLERANCE
 from tslam_bench.errors import AssetError
 from tslam_bench.files import package_data
@@ -173,9 +173,9 @@ def test_aliases_are_byte_identical_in_the_source():
 
 
 def run(arguments: list[str], capsys) -> tuple[int, str, str]:
-    """Exit status and both outputs of ``tslam-bench assets``."""
+    """Exit status and both outputs of ``tslam-bench assets ...``."""
     try:
-        assets.main(arguments)
+        main(["assets", *arguments])
         status = 0
     except SystemExit as exit_:
         status = int(exit_.code or 0)

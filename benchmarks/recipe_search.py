@@ -1,0 +1,253 @@
+"""Searches the recipe of the learned explorers: where ``TrainingConfig``'s defaults come from.
+
+    python benchmarks/recipe_search.py --output search.jsonl --steps 256000 --candidates default slower_adam
+    python benchmarks/recipe_search.py --output search.jsonl --steps 800000 --seeds 0 1 --candidates ...
+    python benchmarks/recipe_search.py --output search.jsonl --document docs/baselines.md
+
+A candidate is a change of the recipe. It is trained by ``train``, as ``tslam-bench baselines train`` does, on a fixed list of
+*train* objects, and then explores a fixed list of *val* objects, by samples of its policy and by the policy's mean. No test
+object is used. Its line is written as soon as it is known; a stopped search goes on where it was, candidates of one round
+are trained side by side. The first line of the file names the objects. Scripted explorers are candidates too.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from report import machine, markdown_table, replace_section
+
+import tslam_bench
+from tslam_bench.assets.store import load_object, prepared_names
+from tslam_bench.baselines.interface import Baseline
+from tslam_bench.baselines.registry import get_baseline, make_baseline
+from tslam_bench.baselines.rollout import roll_out_batch
+from tslam_bench.baselines.training import CURVE_FILE, train
+from tslam_bench.baselines.training_config import TrainingConfig
+from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.grids import merge, world_to_object
+from tslam_bench.leaderboard.metrics import TouchCoverage
+
+SALT: Final = "0"
+REPEATS: Final = {4: 0.97, 1: 0.9924, 2: 0.985, 8: 0.94}
+"""Action repeat -> gamma per decision, the same per control step."""
+CANDIDATES: Final[dict[str, dict[str, Any]]] = {
+    "random_targets": {"baseline": "random_targets"},
+    "heuristic": {"baseline": "heuristic"},
+    "start": {},
+    "lr 1e-4": {"learning_rate": 1e-4},
+    "3 epochs": {"epochs": 3},
+    "10 epochs": {"epochs": 10},
+    "std .3": {"initial_std": 0.3},
+    "std 1": {"initial_std": 1.0},
+    "gamma .99": {"gamma": 0.99},
+    "gamma .95": {"gamma": 0.95},
+}
+"""Name -> changes of the recipe that the search began with (``START``)."""
+START: Final[dict[str, Any]] = {"baseline": "tslam"}
+"""The recipe that the search began with."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Trains candidates and compares them."""
+
+    output: Path
+    """JSON lines: the objects first, then one line per candidate, budget and seed."""
+    candidates: tuple[str, ...] = ()
+    """Names of candidates to train, in this order; those that have their line are left out."""
+    steps: int = 256_000
+    """Control steps of each."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of each."""
+    models: Path = Path("runs/recipe_search")
+    """Folder for the trained models."""
+    side_by_side: int = 2
+    """Candidates that are trained at a time, each with one process that simulates and one thread that learns."""
+    train_objects: int = 96
+    """Train objects, spread evenly over the names of those that are prepared when the search begins."""
+    val_objects: int = 24
+    """Val objects, chosen likewise."""
+    poses: tuple[int, ...] = (0, 2, 5, 7)
+    """Poses in which each val object is explored."""
+    document: Path | None = None
+    """Page whose section ``recipe`` is replaced by the table."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One candidate to train and judge."""
+
+    name: str
+    steps: int
+    seed: int
+    models: Path
+    train_objects: tuple[str, ...]
+    val_objects: tuple[str, ...]
+    poses: tuple[int, ...]
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """What a line is found by; scripted explorers have no budget and no seed."""
+        return (self.name, self.steps, self.seed)
+
+
+def spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """``count`` of the names, evenly spread; all if there are fewer."""
+    chosen = np.unique(np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int))
+    return tuple(names[index] for index in chosen)
+
+
+@cache
+def coverage(name: str) -> TouchCoverage:
+    """Which touched voxels cover which samples of a val object's surface."""
+    return TouchCoverage(load_object(name, "val").surface_points[:20_000])
+
+
+def explore(explorer: Baseline, objects: Sequence[str], poses: Sequence[int]) -> dict[str, float]:
+    """Touched voxels per pose with their standard error over objects, and surface touched after one pose and after all."""
+    episodes = [(name, pose, 0) for name in objects for pose in poses]
+    envs = tslam_bench.make_vec(
+        ENVIRONMENT_ID,
+        min(len(episodes), 32),
+        "cpu",
+        objects=tuple(objects),
+        split="val",
+        control_mode=explorer.control_mode,
+        reward_mode="none",
+        processes=1,
+    )
+    touched: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in objects}
+    voxels: dict[str, list[int]] = {name: [] for name in objects}
+    try:
+        for first in range(0, len(episodes), envs.num_envs):
+            for rollout in roll_out_batch(envs, explorer, episodes[first : first + envs.num_envs], SALT):
+                touched[rollout.object].append(world_to_object(rollout.touched, rollout.pose))
+                voxels[rollout.object].append(int(rollout.touched.sum()))
+    finally:
+        envs.close()
+    means = np.array([np.mean(counts) for counts in voxels.values()])
+    one = [np.mean([coverage(name).recall(grid) for grid in grids]) for name, grids in touched.items()]
+    every = [coverage(name).recall(merge(grids)) for name, grids in touched.items()]
+    return {
+        "touched": round(float(means.mean()), 1),
+        "error": round(float(means.std(ddof=1) / np.sqrt(len(means))), 1),
+        "recall_1": round(float(np.mean(one)), 4),
+        f"recall_{len(poses)}": round(float(np.mean(every)), 4),
+    }
+
+
+def run(task: Task) -> dict[str, Any]:
+    """Trains a candidate, or goes on with it, and judges it."""
+    torch.set_num_threads(1)
+    changes = CANDIDATES[task.name]
+    start = time.perf_counter()
+    line: dict[str, Any] = {"candidate": task.name, "changes": changes, "steps": task.steps, "seed": task.seed}
+    baseline = changes.get("baseline", "tslam")
+    if get_baseline(baseline).kind == "scripted":
+        line["sampled"] = explore(make_baseline(baseline), task.val_objects, task.poses)
+        return line | {"seconds": round(time.perf_counter() - start, 1)}
+    recipe = replace(
+        TrainingConfig(**START),
+        steps=task.steps,
+        seed=task.seed,
+        objects=task.train_objects,
+        processes=1,
+        torch_threads=1,
+        **changes,
+    )
+    folder = task.models / f"{task.name.replace(' ', '_')}-{task.steps}-{task.seed}"
+    metadata = train(recipe, folder)
+    curve = [json.loads(text) for text in (folder / CURVE_FILE).read_text(encoding="utf-8").splitlines()]
+    last = curve[-max(1, len(curve) // 8) :]
+    names = ("episode/touched_voxels", "train/approximate_kl", "train/clip_fraction", "train/std")
+    line["train"] = {name.split("/")[1]: round(float(np.mean([entry[name] for entry in last])), 4) for name in names}
+    line["train"]["explained_variance"] = round(float(np.mean([e["train/explained_variance"] for e in last])), 3)
+    for way, deterministic in (("sampled", False), ("mean", True)):
+        line[way] = explore(make_baseline(baseline, folder, deterministic), task.val_objects, task.poses)
+    return line | {"train_seconds": metadata["seconds"], "seconds": round(time.perf_counter() - start, 1)}
+
+
+def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
+    """Markdown of all lines, the best of each budget first."""
+    text = (
+        f"{objects['machine']}; {len(objects['train'])} train objects, {len(objects['val'])} val objects in poses "
+        f"{', '.join(map(str, objects['poses']))}.\n\n"
+    )
+    header = (
+        *("candidate", "seed", "touched voxels, sampled", "by the mean", "surface after 1 / all poses"),
+        *("on train", "std", "KL", "clipped", "min"),
+    )
+    for steps in sorted({line["steps"] for line in lines}, reverse=True):
+        rows = []
+        chosen = [line for line in lines if line["steps"] == steps]
+        for line in sorted(chosen, key=lambda entry: -entry["sampled"]["touched"]):
+            sampled, trained = line["sampled"], line.get("train")
+            recall = " / ".join(f"{value:.3f}"[1:] for key, value in sampled.items() if key.startswith("recall"))
+            row = [
+                line["candidate"],
+                line["seed"] if trained else "",
+                f"{sampled['touched']:.0f} +- {sampled['error']:.0f}",
+            ]
+            row += [f"{line['mean']['touched']:.0f}" if trained else "", recall]
+            row += (
+                [f"{trained['touched_voxels']:.0f}", f"{trained['std']:.2f}"]
+                + [f"{trained['approximate_kl']:.3f}", f"{trained['clip_fraction']:.2f}"]
+                if trained
+                else [""] * 4
+            )
+            rows.append((*row, f"{line['seconds'] / 60:.1f}"))
+        title = f"{steps:,} control steps" if steps else "Without training"
+        text += f"{title}:\n\n{markdown_table(header, rows)}\n"
+    return text
+
+
+def main(config: Config) -> None:
+    """Trains what is missing, prints every line, and writes the table."""
+    unknown = [name for name in config.candidates if name not in CANDIDATES]
+    if unknown:
+        raise InvalidInputError(f"candidate {unknown[0]!r}: unknown; choose from {', '.join(CANDIDATES)}")
+    if not config.output.is_file():
+        objects = {
+            "machine": machine(),
+            "train": spread(prepared_names("train"), config.train_objects),
+            "val": spread(prepared_names("val"), config.val_objects),
+            "poses": config.poses,
+        }
+        config.output.write_text(json.dumps(objects) + "\n", encoding="utf-8")
+    objects, *lines = map(json.loads, config.output.read_text(encoding="utf-8").splitlines())
+    done = {(line["candidate"], line["steps"], line["seed"]) for line in lines}
+    tasks = []
+    for seed in config.seeds:
+        for name in config.candidates:
+            scripted = get_baseline(CANDIDATES[name].get("baseline", "tslam")).kind == "scripted"
+            budget, number = (0, 0) if scripted else (config.steps, seed)
+            given = (tuple(objects[key]) for key in ("train", "val", "poses"))
+            task = Task(name, budget, number, config.models, *given)
+            if task.key not in done:
+                done.add(task.key)
+                tasks.append(task)
+    with ProcessPoolExecutor(config.side_by_side, get_context("spawn"), max_tasks_per_child=1) as pool:
+        for future in as_completed([pool.submit(run, task) for task in tasks]):
+            lines.append(future.result())
+            with config.output.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(lines[-1]) + "\n")
+            print(json.dumps(lines[-1]), flush=True)
+    if config.document is not None:
+        replace_section(config.document, "recipe", section(lines, objects))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

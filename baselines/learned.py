@@ -29,16 +29,23 @@ class LearnedBaseline:
         control_mode: what its actions mean.
         action_repeat: control steps that each action is held for.
         deterministic: act by the mean.
+        noise_correlation: correlation of the noise in one decision with that in the next.
     """
 
     def __init__(
-        self, network: PolicyNetwork, control_mode: str, action_repeat: int = 1, deterministic: bool = False
+        self,
+        network: PolicyNetwork,
+        control_mode: str,
+        action_repeat: int = 1,
+        deterministic: bool = False,
+        noise_correlation: float = 0.0,
     ) -> None:
         self.control_mode = control_mode
         self._network = network.eval().requires_grad_(False)
         self._repeat = action_repeat
         self._deterministic = deterministic
-        self._deviation = torch.exp(network.log_std).numpy()
+        self._correlation = noise_correlation
+        self._noise: NDArray[np.float32] | None = None
         self._generators: list[np.random.Generator] = []
         self._step = 0
 
@@ -64,12 +71,18 @@ class LearnedBaseline:
             raise InvalidInputError(
                 f"{directory}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
             )
-        return cls(network, mode, repeat, deterministic)
+        correlation = config.get("noise_correlation", 0.0)
+        if not isinstance(correlation, int | float) or not 0 <= correlation <= 1:
+            raise InvalidInputError(
+                f"{directory}: noise_correlation {correlation!r} is unusable; train it: {command}"
+            )
+        return cls(network, mode, repeat, deterministic, float(correlation))
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
         self._generators = episode_generators(num_envs, seed)
         self._step = 0
+        self._noise = None
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
         """See :class:`tslam_bench.baselines.interface.Baseline`."""
@@ -86,11 +99,14 @@ class LearnedBaseline:
             encoded = self._network.encode(tensors)
             # One at a time: the bits of a batched product depend on the batch, an episode must not.
             rows = [
-                self._network.mean_action(encoded.rows(slice(row, row + 1))).numpy()
+                torch.cat(self._network.distribution(encoded.rows(slice(row, row + 1)))).numpy()
                 for row in range(len(self._generators))
             ]
-        actions = np.concatenate(rows)
-        if not self._deterministic:
-            noise = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
-            actions = actions + self._deviation * np.stack(noise)
-        return np.clip(actions, -1, 1)
+        mean, log_std = np.stack(rows, axis=1)
+        if self._deterministic:
+            return np.clip(mean, -1, 1)
+        drawn = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
+        fresh, correlation = np.stack(drawn), np.float32(self._correlation)
+        first = self._noise is None
+        self._noise = fresh if first else correlation * self._noise + np.sqrt(1 - correlation**2) * fresh
+        return np.clip(mean + np.exp(log_std) * self._noise, -1, 1)

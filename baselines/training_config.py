@@ -20,7 +20,7 @@ MODEL_FILE: Final = "model.safetensors"
 """A finished model's weights: numbers alone, so that a stranger's model cannot run code."""
 METADATA_FILE: Final = "model.json"
 """Written last: a model directory without it is unfinished."""
-NetworkName = Literal["fast", "paper"]
+NetworkName = Literal["fast", "hand", "paper"]
 ControlMode = Literal["pd_joint_pos", "pd_joint_delta_pos"]
 
 
@@ -43,9 +43,13 @@ class TrainingConfig:
     action_repeat: int = 4
     """Control steps that each action is held for; a divisor of the episode's 200."""
     network: NetworkName = "fast"
-    """Policy network; fast: matrix products for a CPU; paper: six 3D convolutions."""
+    """Policy network; fast: matrix products for a CPU; hand: the same, and once more around the hand; paper: six 3D convolutions."""
     initial_std: float = 0.6
     """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
+    state_std: bool = False
+    """The standard deviations depend on the observation; else on the joint alone."""
+    noise_correlation: float = 0.0
+    """Correlation of the policy's noise in one decision with that in the next of an episode; 0: independent."""
     num_envs: int = 32
     """Environments that are stepped side by side."""
     rollout_steps: int = HORIZON
@@ -58,12 +62,20 @@ class TrainingConfig:
     """No further pass once the approximate KL divergence from the policy that acted exceeds this."""
     learning_rate: float = 3e-4
     """Adam's step size."""
+    final_learning_rate: float = 1.0
+    """Share of the step size that is left at the end, reached linearly."""
+    std_learning_rate: float = 1.0
+    """Factor on the step size of the standard deviations that depend on the joint alone."""
     gamma: float = 0.97
     """Discount per decision; 0.97 per 4 control steps is 0.992 per control step (paper: 0.99)."""
     gae_lambda: float = 0.95
     """Decay of generalised advantage estimation."""
     clip_range: float = 0.2
     """PPO's clip of the probability ratio."""
+    clip_each_joint: bool = False
+    """Each joint's probability ratio is clipped by itself, not their product."""
+    coverage_bonus: float = 0.0
+    """Added to the reward for each newly visited voxel while learning, beside what the baseline's reward pays."""
     value_coefficient: float = 0.5
     """Weight of the value's squared error."""
     entropy_coefficient: float = 0.0
@@ -93,9 +105,12 @@ class TrainingConfig:
         for name in ("initial_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be a number above 0")
-        for name in ("value_coefficient", "entropy_coefficient"):
+        for name in ("value_coefficient", "entropy_coefficient", "std_learning_rate", "coverage_bonus"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must not be negative")
+        for name in ("noise_correlation", "final_learning_rate"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InvalidInputError(f"{name} {getattr(self, name)}: must lie in [0, 1]")
         if self.processes is not None and self.processes < 1:
             raise InvalidInputError(f"processes {self.processes}: must be at least 1")
         if self.seed < 0:

@@ -41,8 +41,6 @@ from tslam_bench.grids import merge, world_to_object
 from tslam_bench.leaderboard.metrics import TouchCoverage
 
 SALT: Final = "0"
-REPEATS: Final = {4: 0.97, 1: 0.9924, 2: 0.985, 8: 0.94}
-"""Action repeat -> gamma per decision, the same per control step."""
 CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "random_targets": {"baseline": "random_targets"},
     "heuristic": {"baseline": "heuristic"},
@@ -54,6 +52,23 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "std 1": {"initial_std": 1.0},
     "gamma .99": {"gamma": 0.99},
     "gamma .95": {"gamma": 0.95},
+    "hand": {"network": "hand"},
+    "clip joints": {"clip_each_joint": True},
+    "std rate 10": {"std_learning_rate": 10.0},
+    "std rate 10, std .4": {"std_learning_rate": 10.0, "initial_std": 0.4},
+    "state std": {"state_std": True},
+    "noise .5": {"noise_correlation": 0.5},
+    "noise .8": {"noise_correlation": 0.8},
+    "lr decay": {"final_learning_rate": 0.0},
+    "64 hands": {"num_envs": 64, "batch_size": 800},
+    "batch 800": {"batch_size": 800},
+    "entropy": {"entropy_coefficient": 0.003},
+    "repeat 1": {"action_repeat": 1, "gamma": 0.9924, "batch_size": 1600},
+    "repeat 2": {"action_repeat": 2, "gamma": 0.985, "batch_size": 800},
+    "repeat 8": {"action_repeat": 8, "gamma": 0.94, "batch_size": 200},
+    "delta": {"control_mode": "pd_joint_delta_pos"},
+    "no coverage": {"baseline": "tslam_no_coverage"},
+    "lambda .02": {"coverage_bonus": 0.015},
 }
 """Name -> changes of the recipe that the search began with (``START``)."""
 START: Final[dict[str, Any]] = {"baseline": "tslam"}

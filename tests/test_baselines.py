@@ -345,7 +345,7 @@ def test_learned_agrees_with_the_network_it_was_made_from(policy) -> None:
     baseline = make("learned mean", policy)
     baseline.reset(3, 0)
     with torch.no_grad():
-        mean, _ = policy(policy.encode({key: torch.from_numpy(value) for key, value in seen.items()}))
+        mean, *_ = policy(policy.encode({key: torch.from_numpy(value) for key, value in seen.items()}))
     assert np.allclose(baseline.act(seen), mean.clamp(-1, 1), atol=1e-5)
 
 

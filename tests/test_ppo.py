@@ -21,6 +21,7 @@ from tslam_bench.constants import GRID_SIZE, NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import SKIN_LINKS
 
+ARM_AT_REST = torch.zeros(3, NUM_JOINTS)
 GENERATOR = np.random.Generator(np.random.PCG64(5))
 
 
@@ -66,7 +67,7 @@ def test_advantages_are_the_weighted_sum_of_all_multi_step_estimates() -> None:
 
 def test_log_probability_is_torchs_own() -> None:
     actions, mean, log_std = (torch.from_numpy(GENERATOR.normal(size=(6, 4))) for _ in range(3))
-    expected = torch.distributions.Normal(mean, log_std[0].exp()).log_prob(actions).sum(1)
+    expected = torch.distributions.Normal(mean, log_std[0].exp()).log_prob(actions)
     torch.testing.assert_close(log_probability(actions, mean, log_std[0]), expected)
 
 
@@ -110,14 +111,14 @@ def test_patches_are_convolutions_that_do_not_overlap() -> None:
             kernel = layer.weight.view(layer.out_features, 2, 2, 2, width).permute(0, 4, 1, 2, 3)
             grid = torch.relu(nn.functional.conv3d(grid, kernel, layer.bias, stride=2))
             width = layer.out_features
-        features = trunk(trunk.encode(occupancy)).view(3, 2, 2, 2, 4).permute(0, 4, 1, 2, 3)
+        features = trunk(trunk.encode(occupancy, ARM_AT_REST)).view(3, 2, 2, 2, 4).permute(0, 4, 1, 2, 3)
     torch.testing.assert_close(features, grid, rtol=1e-4, atol=1e-5)
 
 
 def test_paper_network_gets_the_grids_bit_by_bit() -> None:
     trunk = ConvolutionTrunk()
     occupancy = observation(3, GENERATOR)["occupancy"]
-    encoded = trunk.encode(occupancy)
+    encoded = trunk.encode(occupancy, ARM_AT_REST)
     assert encoded.shape == (3, 8192) and encoded.dtype == torch.uint8
     assert torch.equal(encoded, torch.from_numpy(np.packbits(occupancy.numpy(), axis=-1, bitorder="little")).flatten(1))
     with torch.no_grad():
@@ -135,11 +136,11 @@ def test_networks_start_as_they_should(name: str) -> None:
         assert "weight" not in key or not torch.equal(weight, different), key
     with torch.no_grad():
         encoded = one.encode(observation(5, GENERATOR))
-        mean, value = one(encoded)
+        mean, _, value = one(encoded)
     assert mean.shape == (5, NUM_JOINTS) and value.shape == (5,)
     assert mean.abs().max() < 0.3 and torch.allclose(one.log_std.exp(), torch.tensor(0.5))
-    torch.testing.assert_close(one.mean_action(encoded), mean)
-    with pytest.raises(InvalidInputError, match=r"network 'huge': unknown; choose one of fast, paper"):
+    torch.testing.assert_close(one.distribution(encoded)[0], mean)
+    with pytest.raises(InvalidInputError, match=r"network 'huge': unknown; choose one of fast, hand, paper"):
         make_network("huge")
 
 
@@ -151,7 +152,7 @@ def test_a_few_touched_voxels_reach_the_features(name: str) -> None:
     grids[1, 0, 10:14, 12:20, 12] = 1
     trunk = make_network(name, seed=3).trunk
     with torch.no_grad():
-        features = trunk(trunk.encode(grids))
+        features = trunk(trunk.encode(grids, ARM_AT_REST[:2]))
     assert (features[1] - features[0]).norm() > 0.02 * features[0].norm()
 
 
@@ -223,7 +224,7 @@ def test_it_learns_what_touch_and_grids_ask_for() -> None:
     assert learner.steps == 60 * 16 * 40
     learner.environments.reset(seed=1)
     with torch.no_grad():
-        mean = learner.network.mean_action(learner.network.encode(learner.environments.buffers))  # type: ignore[attr-defined]
+        mean, _ = learner.network.distribution(learner.network.encode(learner.environments.buffers))  # type: ignore[attr-defined]
     asked = learner.environments.asked  # type: ignore[attr-defined]
     assert (mean[:, :2] - asked).abs().mean() < 0.15
 

@@ -73,9 +73,7 @@ class LearnedBaseline:
             )
         correlation = config.get("noise_correlation", 0.0)
         if not isinstance(correlation, int | float) or not 0 <= correlation <= 1:
-            raise InvalidInputError(
-                f"{directory}: noise_correlation {correlation!r} is unusable; train it: {command}"
-            )
+            raise InvalidInputError(f"{directory}: noise_correlation {correlation!r} is unusable; train it: {command}")
         return cls(network, mode, repeat, deterministic, float(correlation))
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:

@@ -205,7 +205,9 @@ class PPO:
             count = [self._tensor(info[name]).float() if name in info else torch.zeros_like(reward) for name in COUNTS]
             reward += self.config.coverage_bonus * count[1]
             fresh = torch.randn(self._noise.shape, generator=self._generator)
-            correlation = self.config.noise_correlation * ~end.cpu()[:, None]  # the next episode begins with other noise
+            correlation = (
+                self.config.noise_correlation * ~end.cpu()[:, None]
+            )  # the next episode begins with other noise
             self._noise = correlation * self._noise + (1 - correlation**2).sqrt() * fresh
             kept.append((action, drawn_with, value, reward, end, torch.stack(count, dim=1)))
             self.steps += self.config.action_repeat * self.environments.num_envs

@@ -43,7 +43,7 @@ class TrainingConfig:
     action_repeat: int = 4
     """Control steps that each action is held for; a divisor of the episode's 200."""
     network: NetworkName = "fast"
-    """Policy network; fast: matrix products for a CPU; hand: the same, and once more around the hand; paper: six 3D convolutions."""
+    """Policy network; fast: matrix products for a CPU; hand: the same, and again around the hand; paper: six 3D convolutions."""
     initial_std: float = 0.6
     """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
     state_std: bool = False

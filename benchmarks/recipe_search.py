@@ -217,12 +217,8 @@ def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
                 f"{sampled['touched']:.0f} +- {sampled['error']:.0f}",
             ]
             row += [f"{line['mean']['touched']:.0f}" if trained else "", recall]
-            row += (
-                [f"{trained['touched_voxels']:.0f}", f"{trained['std']:.2f}"]
-                + [f"{trained['approximate_kl']:.3f}", f"{trained['clip_fraction']:.2f}"]
-                if trained
-                else [""] * 4
-            )
+            names = ("touched_voxels", "std", "approximate_kl", "clip_fraction")
+            row += [f"{trained[n]:.{d}f}" for n, d in zip(names, (0, 2, 3, 2), strict=True)] if trained else [""] * 4
             rows.append((*row, f"{line['seconds'] / 60:.1f}"))
         title = f"{steps:,} control steps" if steps else "Without training"
         text += f"{title}:\n\n{markdown_table(header, rows)}\n"

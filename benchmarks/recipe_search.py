@@ -27,20 +27,19 @@ import torch
 import tyro
 from numpy.typing import NDArray
 from report import machine, markdown_table, replace_section
+from rollouts import Hands
 
-import tslam_bench
 from tslam_bench.assets.store import load_object, prepared_names
 from tslam_bench.baselines.interface import Baseline
 from tslam_bench.baselines.registry import get_baseline, make_baseline
-from tslam_bench.baselines.rollout import roll_out_batch
 from tslam_bench.baselines.training import CURVE_FILE, train
 from tslam_bench.baselines.training_config import TrainingConfig
-from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.constants import HORIZON
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.leaderboard.metrics import TouchCoverage
+from tslam_bench.tasks.batch import OBSERVATION_ARRAYS, BatchSettings
 
-SALT: Final = "0"
 CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "random_targets": {"baseline": "random_targets"},
     "heuristic": {"baseline": "heuristic"},
@@ -133,27 +132,21 @@ def coverage(name: str) -> TouchCoverage:
 
 def explore(explorer: Baseline, objects: Sequence[str], poses: Sequence[int]) -> dict[str, float]:
     """Touched voxels per pose with their standard error over objects, and surface touched after one pose and after all."""
-    episodes = [(name, pose, 0) for name in objects for pose in poses]
-    envs = tslam_bench.make_vec(
-        ENVIRONMENT_ID,
-        min(len(episodes), 32),
-        "cpu",
-        objects=tuple(objects),
-        split="val",
-        control_mode=explorer.control_mode,
-        reward_mode="none",
-        processes=1,
+    settings = BatchSettings(
+        objects=tuple(objects), split="val", control_mode=explorer.control_mode, reward_mode="none"
     )
+    hands = Hands(len(objects), settings)
+    seen = {name: hands.arrays[name] for name in OBSERVATION_ARRAYS}
     touched: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in objects}
-    voxels: dict[str, list[int]] = {name: [] for name in objects}
-    try:
-        for first in range(0, len(episodes), envs.num_envs):
-            for rollout in roll_out_batch(envs, explorer, episodes[first : first + envs.num_envs], SALT):
-                touched[rollout.object].append(world_to_object(rollout.touched, rollout.pose))
-                voxels[rollout.object].append(int(rollout.touched.sum()))
-    finally:
-        envs.close()
-    means = np.array([np.mean(counts) for counts in voxels.values()])
+    for pose in poses:
+        seeds = [int(seed) for seed in np.random.SeedSequence([pose]).generate_state(len(objects))]
+        explorer.reset(len(objects), seeds)
+        hands.reset(1000 * pose, objects, [pose] * len(objects))
+        for _ in range(HORIZON):
+            hands.step(explorer.act(seen))
+        for name, grid in zip(objects, hands.arrays["final_occupancy"][:, 0].astype(bool), strict=True):
+            touched[name].append(world_to_object(grid, pose))
+    means = np.array([np.mean([grid.sum() for grid in grids]) for grids in touched.values()])
     one = [np.mean([coverage(name).recall(grid) for grid in grids]) for name, grids in touched.items()]
     every = [coverage(name).recall(merge(grids)) for name, grids in touched.items()]
     return {

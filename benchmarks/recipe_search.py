@@ -243,7 +243,7 @@ def main(config: Config) -> None:
             if task.key not in done:
                 done.add(task.key)
                 tasks.append(task)
-    with ProcessPoolExecutor(config.side_by_side, get_context("spawn"), max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(config.side_by_side, get_context("spawn")) as pool:
         for future in as_completed([pool.submit(run, task) for task in tasks]):
             lines.append(future.result())
             with config.output.open("a", encoding="utf-8") as stream:

@@ -21,7 +21,7 @@ from tslam_bench.files import atomic_file, write_json
 
 
 def make_network(
-    name: str, initial_std: float = 0.6, seed: int | None = None, state_std: bool = False
+    name: str, initial_std: float = 0.6, seed: int | None = None, state_std: bool = False, clock: int = 0
 ) -> PolicyNetwork:
     """A registered network; its weights are drawn from ``seed``.
 
@@ -31,7 +31,7 @@ def make_network(
     if name not in NETWORKS:
         raise InvalidInputError(f"network {name!r}: unknown; choose one of {', '.join(NETWORKS)}")
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    return NETWORKS[name](initial_std, generator, state_std)
+    return NETWORKS[name](initial_std, generator, state_std, clock)
 
 
 def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, Any]) -> None:
@@ -54,7 +54,9 @@ def read_model(directory: Path) -> tuple[PolicyNetwork, dict[str, Any]]:
             raise InvalidInputError(f"{directory}: holds no finished model ({name} is missing)")
     try:
         metadata = json.loads((directory / METADATA_FILE).read_text(encoding="utf-8"))
-        network = make_network(metadata["config"]["network"], state_std=metadata["config"].get("state_std", False))
+        recipe = metadata["config"]
+        extras = {"state_std": recipe.get("state_std", False), "clock": recipe.get("clock", 0)}
+        network = make_network(recipe["network"], **extras)
         network.load_state_dict(load_file(directory / MODEL_FILE, device="cpu"))
     except Exception as error:  # damaged files fail in json, safetensors or torch
         reason = str(error).strip().splitlines()[0] if str(error).strip() else ""

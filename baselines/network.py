@@ -41,7 +41,7 @@ class Encoded:
 
     Attributes:
         grid: (n, 8192 or more) uint8, both grids.
-        flat: (n, FLAT_SIZE) float32, of the order of 1.
+        flat: (n, FLAT_SIZE or more) float32, of the order of 1.
     """
 
     grid: Tensor
@@ -174,10 +174,12 @@ class PolicyNetwork(nn.Module):
         initial_std: standard deviation of the untrained policy, the same for all joints.
         generator: draws the weights; None leaves torch's own.
         state_std: the standard deviations depend on the observation, not on the joint alone.
+        clock: so many sine and cosine pairs of the time are inputs too; they turn once, twice, 4, 8, ... times per episode.
     """
 
     _middle: Tensor
     _half_range: Tensor
+    _turns: Tensor
 
     def __init__(
         self,
@@ -186,11 +188,14 @@ class PolicyNetwork(nn.Module):
         initial_std: float = 0.6,
         generator: torch.Generator | None = None,
         state_std: bool = False,
+        clock: int = 0,
     ) -> None:
         super().__init__()
         self.trunk = trunk
-        self.policy = _mlp(trunk.out_features + FLAT_SIZE, hidden, NUM_JOINTS * (2 if state_std else 1))
-        self.value = _mlp(trunk.out_features + FLAT_SIZE, hidden, 1)
+        features = trunk.out_features + FLAT_SIZE + 2 * clock
+        self.policy = _mlp(features, hidden, NUM_JOINTS * (2 if state_std else 1))
+        self.value = _mlp(features, hidden, 1)
+        self.register_buffer("_turns", 2 * torch.pi * 2.0 ** torch.arange(clock), persistent=False)
         self.log_std = nn.Parameter(torch.full((NUM_JOINTS,), float(np.log(initial_std))))
         limits = torch.as_tensor(np.asarray(JOINT_LIMITS, dtype=np.float32))
         self.register_buffer("_middle", limits.mean(dim=1), persistent=False)
@@ -209,11 +214,14 @@ class PolicyNetwork(nn.Module):
     def encode(self, observation: Mapping[str, Tensor]) -> Encoded:
         """Entries of protocol section 6, each (n, ...) -> what the other methods take."""
         with torch.no_grad():
+            angles = observation["time"].float() * self._turns
             parts = (
                 (observation["qpos"].float() - self._middle) / self._half_range,
                 observation["qvel"].float() / VELOCITY_SCALE,
                 observation["time"].float(),
                 observation["touch"].float(),
+                angles.sin(),
+                angles.cos(),
             )
             return Encoded(self.trunk.encode(observation["occupancy"], observation["qpos"]), torch.cat(parts, dim=1))
 

@@ -80,7 +80,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
     threads = torch.get_num_threads()
     environments = make_training_environments(config)
     try:
-        network = make_network(config.network, config.initial_std, config.seed, config.state_std)
+        network = make_network(config.network, config.initial_std, config.seed, config.state_std, config.clock)
         learner = PPO(config, environments, network, learning_device(config))
         if checkpoint is not None and state is not None:
             tensors = torch.load(checkpoint / CHECKPOINT_TENSORS, map_location=learner.device, weights_only=True)

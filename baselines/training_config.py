@@ -44,6 +44,8 @@ class TrainingConfig:
     """Control steps that each action is held for; a divisor of the episode's 200."""
     network: NetworkName = "fast"
     """Policy network; fast: matrix products for a CPU; hand: the same, and again around the hand; paper: six 3D convolutions."""
+    clock: int = 0
+    """Sine and cosine pairs of the time among the network's inputs, turning once, twice, 4, 8, ... times per episode."""
     initial_std: float = 0.6
     """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
     state_std: bool = False
@@ -105,6 +107,8 @@ class TrainingConfig:
         for name in ("initial_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be a number above 0")
+        if not 0 <= self.clock <= 6:
+            raise InvalidInputError(f"clock {self.clock}: must lie in [0, 6]")  # the next turns faster than a step
         for name in ("value_coefficient", "entropy_coefficient", "std_learning_rate", "coverage_bonus"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must not be negative")

@@ -7,7 +7,7 @@ and command.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,12 @@ from tslam_bench.files import atomic_file, write_json
 
 
 def make_network(
-    name: str, initial_std: float = 0.6, seed: int | None = None, state_std: bool = False, clock: int = 0
+    name: str,
+    initial_std: float | Sequence[float] = 0.6,
+    seed: int | None = None,
+    state_std: bool = False,
+    clock: int = 0,
+    initial_mean: float | Sequence[float] = 0.0,
 ) -> PolicyNetwork:
     """A registered network; its weights are drawn from ``seed``.
 
@@ -31,7 +36,7 @@ def make_network(
     if name not in NETWORKS:
         raise InvalidInputError(f"network {name!r}: unknown; choose one of {', '.join(NETWORKS)}")
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    return NETWORKS[name](initial_std, generator, state_std, clock)
+    return NETWORKS[name](initial_std, generator, state_std, clock, initial_mean)
 
 
 def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ policy and value from that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -171,10 +171,11 @@ class PolicyNetwork(nn.Module):
     Args:
         trunk: features of the grids.
         hidden: widths of each MLP's hidden layers.
-        initial_std: standard deviation of the untrained policy, the same for all joints.
+        initial_std: standard deviation of the untrained policy, one for all joints or (28,).
         generator: draws the weights; None leaves torch's own.
         state_std: the standard deviations depend on the observation, not on the joint alone.
         clock: so many sine and cosine pairs of the time are inputs too; they turn once, twice, 4, 8, ... times per episode.
+        initial_mean: mean action of the untrained policy, one for all joints or (28,).
     """
 
     _middle: Tensor
@@ -185,10 +186,11 @@ class PolicyNetwork(nn.Module):
         self,
         trunk: PatchTrunk | HandTrunk | ConvolutionTrunk,
         hidden: tuple[int, ...],
-        initial_std: float = 0.6,
+        initial_std: float | Sequence[float] = 0.6,
         generator: torch.Generator | None = None,
         state_std: bool = False,
         clock: int = 0,
+        initial_mean: float | Sequence[float] = 0.0,
     ) -> None:
         super().__init__()
         self.trunk = trunk
@@ -196,12 +198,14 @@ class PolicyNetwork(nn.Module):
         self.policy = _mlp(features, hidden, NUM_JOINTS * (2 if state_std else 1))
         self.value = _mlp(features, hidden, 1)
         self.register_buffer("_turns", 2 * torch.pi * 2.0 ** torch.arange(clock), persistent=False)
-        self.log_std = nn.Parameter(torch.full((NUM_JOINTS,), float(np.log(initial_std))))
+        self.log_std = nn.Parameter(torch.tensor(initial_std).log() + torch.zeros(NUM_JOINTS))
         limits = torch.as_tensor(np.asarray(JOINT_LIMITS, dtype=np.float32))
         self.register_buffer("_middle", limits.mean(dim=1), persistent=False)
         self.register_buffer("_half_range", (limits[:, 1] - limits[:, 0]) / 2, persistent=False)
         if generator is not None:
             self._initialise(generator)
+        with torch.no_grad():
+            self.policy[-1].bias[:NUM_JOINTS] += torch.tensor(initial_mean)
 
     def _initialise(self, generator: torch.Generator) -> None:
         """Orthogonal weights. With torch's default a few touched voxels are lost on their way through six layers."""

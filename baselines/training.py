@@ -26,12 +26,14 @@ from torch.utils.tensorboard import SummaryWriter
 import tslam_bench
 from tslam_bench.assets.store import asset_sha256, list_objects
 from tslam_bench.baselines.model_files import make_network, write_model
+from tslam_bench.baselines.network import PolicyNetwork
 from tslam_bench.baselines.ppo import PPO
 from tslam_bench.baselines.registry import get_baseline
 from tslam_bench.baselines.training_config import METADATA_FILE, PAPER_STEPS, TrainingConfig
-from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
+from tslam_bench.hand_constants import ARM_JOINTS, JOINT_NAMES
 from tslam_bench.tasks.rewards import COVERAGE_WEIGHT
 
 CHECKPOINT_STATE: Final = "state.json"
@@ -80,7 +82,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
     threads = torch.get_num_threads()
     environments = make_training_environments(config)
     try:
-        network = make_network(config.network, config.initial_std, config.seed, config.state_std, config.clock)
+        network = untrained_network(config)
         learner = PPO(config, environments, network, learning_device(config))
         if checkpoint is not None and state is not None:
             tensors = torch.load(checkpoint / CHECKPOINT_TENSORS, map_location=learner.device, weights_only=True)
@@ -120,6 +122,17 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
     write_model(output, network, metadata)
     shutil.rmtree(output / "checkpoints", ignore_errors=True)
     return metadata
+
+
+def untrained_network(config: TrainingConfig) -> PolicyNetwork:
+    """The policy that a run begins with; its weights are drawn from the run's seed."""
+    arm = [JOINT_NAMES.index(name) for name in ARM_JOINTS[:3]]
+    std = np.full(NUM_JOINTS, config.initial_std, dtype=np.float32)
+    std[arm] = config.initial_arm_std
+    mean = np.zeros(NUM_JOINTS, dtype=np.float32)
+    if config.control_mode == "pd_joint_pos":  # where the palm rests on what lies in the workspace
+        mean[arm] = config.initial_aim
+    return make_network(config.network, std.tolist(), config.seed, config.state_std, config.clock, mean.tolist())
 
 
 def make_training_environments(config: TrainingConfig) -> VectorEnv:

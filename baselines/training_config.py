@@ -47,7 +47,11 @@ class TrainingConfig:
     clock: int = 0
     """Sine and cosine pairs of the time among the network's inputs, turning once, twice, 4, 8, ... times per episode."""
     initial_std: float = 0.6
-    """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
+    """Standard deviation of the untrained policy in fingers, wrist and roll; an action of 1 is a joint's limit."""
+    initial_arm_std: float = 0.6
+    """The same of the arm's three translations."""
+    initial_aim: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Mean action of the untrained policy for the arm: sideways, up, forward; of ``pd_joint_pos`` only."""
     state_std: bool = False
     """The standard deviations depend on the observation; else on the joint alone."""
     noise_correlation: float = 0.0
@@ -104,9 +108,11 @@ class TrainingConfig:
         ):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
-        for name in ("initial_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
+        for name in ("initial_std", "initial_arm_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be a number above 0")
+        if not all(-1 <= value <= 1 for value in self.initial_aim):
+            raise InvalidInputError(f"initial_aim {self.initial_aim}: actions must lie in [-1, 1]")
         if not 0 <= self.clock <= 6:
             raise InvalidInputError(f"clock {self.clock}: must lie in [0, 6]")  # the next turns faster than a step
         for name in ("value_coefficient", "entropy_coefficient", "std_learning_rate", "coverage_bonus"):

@@ -40,6 +40,10 @@ from tslam_bench.grids import merge, world_to_object
 from tslam_bench.leaderboard.metrics import TouchCoverage
 from tslam_bench.tasks.batch import OBSERVATION_ARRAYS, BatchSettings
 
+AIM: Final[dict[str, Any]] = {"initial_aim": (0.0, -0.4, 0.2)}
+"""The untrained policy rests on the middle of the workspace."""
+BROAD: Final[dict[str, Any]] = {"initial_std": 1.0, "initial_arm_std": 0.3}
+"""Fingers move more than the arm."""
 CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "random_targets": {"baseline": "random_targets"},
     "heuristic": {"baseline": "heuristic"},
@@ -47,22 +51,30 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "lr 1e-4": {"learning_rate": 1e-4},
     "3 epochs": {"epochs": 3},
     "10 epochs": {"epochs": 10},
-    "std .3": {"initial_std": 0.3},
-    "std 1": {"initial_std": 1.0},
+    "std .3": {"initial_std": 0.3, "initial_arm_std": 0.3},
+    "std 1": {"initial_std": 1.0, "initial_arm_std": 1.0},
     "gamma .99": {"gamma": 0.99},
     "gamma .9": {"gamma": 0.9},
     "gamma .9, lambda .8": {"gamma": 0.9, "gae_lambda": 0.8},
     "hand": {"network": "hand"},
     "clip joints": {"clip_each_joint": True},
     "std rate 10": {"std_learning_rate": 10.0},
-    "std rate 10, std .4": {"std_learning_rate": 10.0, "initial_std": 0.4},
+    "std rate 10, std .4": {"std_learning_rate": 10.0, "initial_std": 0.4, "initial_arm_std": 0.4},
     "state std": {"state_std": True},
     "noise .5": {"noise_correlation": 0.5},
     "noise .8": {"noise_correlation": 0.8},
     "clock": {"clock": 5},
-    "clock, std .3": {"clock": 5, "initial_std": 0.3},
+    "clock, std .3": {"clock": 5, "initial_std": 0.3, "initial_arm_std": 0.3},
     "clock, clip joints": {"clock": 5, "clip_each_joint": True},
     "hand, clip joints": {"network": "hand", "clip_each_joint": True},
+    "aim": AIM,
+    "aim, broad fingers": {**AIM, **BROAD},
+    "aim, broad fingers, clock": {**AIM, **BROAD, "clock": 5},
+    "aim, broad fingers, clock, hand": {**AIM, **BROAD, "clock": 5, "network": "hand"},
+    "aim, broad fingers, clock, clip joints": {**AIM, **BROAD, "clock": 5, "clip_each_joint": True},
+    "aim, broad fingers, gamma .9, lambda .8": {**AIM, **BROAD, "gamma": 0.9, "gae_lambda": 0.8},
+    "aim, broad fingers, std rate 10": {**AIM, **BROAD, "std_learning_rate": 10.0},
+    "aim, broad fingers, repeat 2": {**AIM, **BROAD, "action_repeat": 2, "gamma": 0.985, "batch_size": 800},
     "lr decay": {"final_learning_rate": 0.0},
     "64 hands": {"num_envs": 64, "batch_size": 800},
     "batch 800": {"batch_size": 800},

@@ -90,21 +90,26 @@ class LearnedBaseline:
         self._step += 1
         return self._held.copy()
 
+    def distribution(self, observation: dict[str, torch.Tensor]) -> tuple[NDArray, NDArray]:
+        """Means (n, 28) and standard deviations (n, 28) of the policy's actions."""
+        encoded = self._network.encode(observation)
+        # One at a time: the bits of a batched product depend on the batch, an episode must not.
+        rows = [
+            torch.cat(self._network.distribution(encoded.rows(slice(row, row + 1)))).numpy()
+            for row in range(len(self._generators))
+        ]
+        mean, log_std = np.stack(rows, axis=1)
+        return mean, np.exp(log_std)
+
     def _decide(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
         """(n, 28) new actions."""
         with torch.inference_mode():
             tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observation.items()}
-            encoded = self._network.encode(tensors)
-            # One at a time: the bits of a batched product depend on the batch, an episode must not.
-            rows = [
-                torch.cat(self._network.distribution(encoded.rows(slice(row, row + 1)))).numpy()
-                for row in range(len(self._generators))
-            ]
-        mean, log_std = np.stack(rows, axis=1)
+            mean, std = self.distribution(tensors)
         if self._deterministic:
             return np.clip(mean, -1, 1)
         drawn = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
         fresh, correlation = np.stack(drawn), np.float32(self._correlation)
         first = self._noise is None
         self._noise = fresh if first else correlation * self._noise + np.sqrt(1 - correlation**2) * fresh
-        return np.clip(mean + np.exp(log_std) * self._noise, -1, 1)
+        return np.clip(mean + std * self._noise, -1, 1)

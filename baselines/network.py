@@ -204,8 +204,10 @@ class PolicyNetwork(nn.Module):
         self.register_buffer("_half_range", (limits[:, 1] - limits[:, 0]) / 2, persistent=False)
         if generator is not None:
             self._initialise(generator)
+        output = self.policy[-1]
+        assert isinstance(output, nn.Linear)
         with torch.no_grad():
-            self.policy[-1].bias[:NUM_JOINTS] += torch.tensor(initial_mean)
+            output.bias[:NUM_JOINTS] += torch.tensor(initial_mean)
 
     def _initialise(self, generator: torch.Generator) -> None:
         """Orthogonal weights. With torch's default a few touched voxels are lost on their way through six layers."""

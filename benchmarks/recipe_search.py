@@ -44,6 +44,8 @@ AIM: Final[dict[str, Any]] = {"initial_aim": (0.0, -0.4, 0.2)}
 """The untrained policy rests on the middle of the workspace."""
 BROAD: Final[dict[str, Any]] = {"initial_std": 1.0, "initial_arm_std": 0.3}
 """Fingers move more than the arm."""
+CALM: Final[dict[str, Any]] = {**AIM, "initial_arm_std": 0.3, "clock": 5}
+"""The arm moves less than the fingers, and the policy is given a clock."""
 CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "random_targets": {"baseline": "random_targets"},
     "heuristic": {"baseline": "heuristic"},
@@ -75,6 +77,15 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "aim, broad fingers, gamma .9, lambda .8": {**AIM, **BROAD, "gamma": 0.9, "gae_lambda": 0.8},
     "aim, broad fingers, std rate 10": {**AIM, **BROAD, "std_learning_rate": 10.0},
     "aim, broad fingers, repeat 2": {**AIM, **BROAD, "action_repeat": 2, "gamma": 0.985, "batch_size": 800},
+    "calm": CALM,
+    "calm, gamma .9, lambda .8": {**CALM, "gamma": 0.9, "gae_lambda": 0.8},
+    "calm, lambda .8": {**CALM, "gae_lambda": 0.8},
+    "calm, state std": {**CALM, "state_std": True},
+    "calm, repeat 2": {**CALM, "action_repeat": 2, "gamma": 0.985, "batch_size": 800},
+    "calm, hand": {**CALM, "network": "hand"},
+    "calm, lr 1e-3": {**CALM, "learning_rate": 1e-3, "target_kl": 0.2},
+    "calm, 64 hands": {**CALM, "num_envs": 64, "batch_size": 800},
+    "calm, no coverage": {**CALM, "baseline": "tslam_no_coverage"},
     "lr decay": {"final_learning_rate": 0.0},
     "64 hands": {"num_envs": 64, "batch_size": 800},
     "batch 800": {"batch_size": 800},

@@ -44,13 +44,13 @@ class TrainingConfig:
     """Control steps that each action is held for; a divisor of the episode's 200."""
     network: NetworkName = "fast"
     """Policy network; fast: matrix products for a CPU; hand: the same, and again around the hand; paper: six 3D convolutions."""
-    clock: int = 0
+    clock: int = 5
     """Sine and cosine pairs of the time among the network's inputs, turning once, twice, 4, 8, ... times per episode."""
-    initial_std: float = 0.6
+    initial_std: float = 1.0
     """Standard deviation of the untrained policy in fingers, wrist and roll; an action of 1 is a joint's limit."""
-    initial_arm_std: float = 0.6
+    initial_arm_std: float = 0.3
     """The same of the arm's three translations."""
-    initial_aim: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    initial_aim: tuple[float, float, float] = (0.0, -0.4, 0.2)
     """Mean action of the untrained policy for the arm: sideways, up, forward; of ``pd_joint_pos`` only."""
     state_std: bool = False
     """The standard deviations depend on the observation; else on the joint alone."""

@@ -46,6 +46,11 @@ BROAD: Final[dict[str, Any]] = {"initial_std": 1.0, "initial_arm_std": 0.3}
 """Fingers move more than the arm."""
 CALM: Final[dict[str, Any]] = {**AIM, "initial_arm_std": 0.3, "clock": 5}
 """The arm moves less than the fingers, and the policy is given a clock."""
+REPEAT: Final[dict[int, dict[str, Any]]] = {
+    repeat: {"action_repeat": repeat, "gamma": round(0.97 ** (repeat / 4), 4), "batch_size": 1600 // repeat}
+    for repeat in (1, 2, 8)
+}
+"""Other action repeats with the same discount per control step and as many minibatches."""
 CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "random_targets": {"baseline": "random_targets"},
     "heuristic": {"baseline": "heuristic"},
@@ -72,11 +77,17 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "aim": AIM,
     "aim, broad fingers": {**AIM, **BROAD},
     "aim, broad fingers, clock": {**AIM, **BROAD, "clock": 5},
+    "aim, broad fingers, clock, no coverage": {**AIM, **BROAD, "clock": 5, "baseline": "tslam_no_coverage"},
+    "aim, broad fingers, clock, lambda .02": {**AIM, **BROAD, "clock": 5, "coverage_bonus": 0.015},
+    "aim, broad fingers, clock, delta": {**AIM, **BROAD, "clock": 5, "control_mode": "pd_joint_delta_pos"},
+    "aim, broad fingers, clock, repeat 1": {**AIM, **BROAD, "clock": 5, **REPEAT[1]},
+    "aim, broad fingers, clock, repeat 2": {**AIM, **BROAD, "clock": 5, **REPEAT[2]},
+    "aim, broad fingers, clock, repeat 8": {**AIM, **BROAD, "clock": 5, **REPEAT[8]},
+    "aim, broad fingers, clock, lr decay": {**AIM, **BROAD, "clock": 5, "final_learning_rate": 0.1},
     "aim, broad fingers, clock, hand": {**AIM, **BROAD, "clock": 5, "network": "hand"},
     "aim, broad fingers, clock, clip joints": {**AIM, **BROAD, "clock": 5, "clip_each_joint": True},
     "aim, broad fingers, gamma .9, lambda .8": {**AIM, **BROAD, "gamma": 0.9, "gae_lambda": 0.8},
     "aim, broad fingers, std rate 10": {**AIM, **BROAD, "std_learning_rate": 10.0},
-    "aim, broad fingers, repeat 2": {**AIM, **BROAD, "action_repeat": 2, "gamma": 0.985, "batch_size": 800},
     "calm": CALM,
     "calm, gamma .9, lambda .8": {**CALM, "gamma": 0.9, "gae_lambda": 0.8},
     "calm, lambda .8": {**CALM, "gae_lambda": 0.8},
@@ -85,20 +96,28 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "calm, hand": {**CALM, "network": "hand"},
     "calm, lr 1e-3": {**CALM, "learning_rate": 1e-3, "target_kl": 0.2},
     "calm, 64 hands": {**CALM, "num_envs": 64, "batch_size": 800},
+    "calm, std rate 10": {**CALM, "std_learning_rate": 10.0},
+    "calm, std rate 10, lr decay": {**CALM, "std_learning_rate": 10.0, "final_learning_rate": 0.1},
     "calm, no coverage": {**CALM, "baseline": "tslam_no_coverage"},
     "lr decay": {"final_learning_rate": 0.0},
     "64 hands": {"num_envs": 64, "batch_size": 800},
     "batch 800": {"batch_size": 800},
     "entropy": {"entropy_coefficient": 0.003},
-    "repeat 1": {"action_repeat": 1, "gamma": 0.9924, "batch_size": 1600},
-    "repeat 2": {"action_repeat": 2, "gamma": 0.985, "batch_size": 800},
-    "repeat 8": {"action_repeat": 8, "gamma": 0.94, "batch_size": 200},
+    "repeat 1": REPEAT[1],
+    "repeat 2": REPEAT[2],
+    "repeat 8": REPEAT[8],
     "delta": {"control_mode": "pd_joint_delta_pos"},
     "no coverage": {"baseline": "tslam_no_coverage"},
     "lambda .02": {"coverage_bonus": 0.015},
 }
 """Name -> changes of the recipe that the search began with (``START``)."""
-START: Final[dict[str, Any]] = {"baseline": "tslam"}
+START: Final[dict[str, Any]] = {
+    "baseline": "tslam",
+    "initial_aim": (0.0, 0.0, 0.0),
+    "initial_std": 0.6,
+    "initial_arm_std": 0.6,
+    "clock": 0,
+}
 """The recipe that the search began with."""
 
 
@@ -196,13 +215,12 @@ def run(task: Task) -> dict[str, Any]:
         line["sampled"] = explore(make_baseline(baseline), task.val_objects, task.poses)
         return line | {"seconds": round(time.perf_counter() - start, 1)}
     recipe = replace(
-        TrainingConfig(**START),
+        TrainingConfig(**(START | changes)),
         steps=task.steps,
         seed=task.seed,
         objects=task.train_objects,
         processes=1,
         torch_threads=1,
-        **changes,
     )
     folder = task.models / f"{task.name.replace(' ', '_')}-{task.steps}-{task.seed}"
     metadata = train(recipe, folder)

@@ -29,23 +29,63 @@ class LearnedBaseline:
         control_mode: what its actions mean.
         action_repeat: control steps that each action is held for.
         deterministic: act by the mean.
+        noise_correlation: correlation of the noise in one decision with that in the next.
     """
 
     def __init__(
-        self, network: PolicyNetwork, control_mode: str, action_repeat: int = 1, deterministic: bool = False
+        self,
+        network: PolicyNetwork,
+        control_mode: str,
+        action_repeat: int = 1,
+        deterministic: bool = False,
+        noise_correlation: float = 0.0,
     ) -> None:
         self.control_mode = control_mode
         self._network = network.eval().requires_grad_(False)
         self._repeat = action_repeat
         self._deterministic = deterministic
-        self._deviation = torch.exp(network.log_std).numpy()
+        self._correlation = noise_correlation
+        self._noise: NDArray[np.float32] | None = None
         self._generators: list[np.random.Generator] = []
         self._step = 0
+
+    @classmethod
+    def load(cls, baseline: str, model: Path | None = None, deterministic: bool = False) -> LearnedBaseline:
+        """The policy of a learned baseline.
+
+        Args:
+            baseline: id, for messages.
+            model: directory that ``tslam-bench baselines train`` wrote.
+            deterministic: act by the mean.
+
+        Raises:
+            InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
+        """
+        command = f"tslam-bench baselines train {baseline} --output {model or 'DIRECTORY'}"
+        if model is None:
+            raise InvalidInputError(
+                f"policy {baseline!r}: needs a trained model; pass its directory, or train one: {command}"
+            )
+        try:
+            network, metadata = read_model(model)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{error}; train it: {command}") from error
+        config = metadata["config"]
+        mode, repeat = config.get("control_mode"), config.get("action_repeat")
+        if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
+            raise InvalidInputError(
+                f"{model}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
+            )
+        correlation = config.get("noise_correlation", 0.0)
+        if not isinstance(correlation, int | float) or not 0 <= correlation <= 1:
+            raise InvalidInputError(f"{model}: noise_correlation {correlation!r} is unusable; train it: {command}")
+        return cls(network, mode, repeat, deterministic, float(correlation))
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """See :class:`tslam_bench.evaluation.policy.Policy`."""
         self._generators = episode_generators(num_envs, seed)
         self._step = 0
+        self._noise = None
 
     def act(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
         """See :class:`tslam_bench.evaluation.policy.Policy`."""
@@ -55,47 +95,27 @@ class LearnedBaseline:
         self._step += 1
         return self._held.copy()
 
+    def distribution(self, observation: dict[str, torch.Tensor]) -> tuple[NDArray, NDArray]:
+        """Means (n, 28) and standard deviations (n, 28) of the policy's actions."""
+        encoded = self._network.encode(observation)
+        # One at a time: the bits of a batched product depend on the batch, an episode must not.
+        rows = [
+            torch.cat(self._network.distribution(encoded.rows(slice(row, row + 1)))).numpy()
+            for row in range(len(self._generators))
+        ]
+        mean, log_std = np.stack(rows, axis=1)
+        return mean, np.exp(log_std)
+
     def _decide(self, observation: Mapping[str, NDArray]) -> NDArray[np.float32]:
         """(n, 28) new actions."""
         with torch.inference_mode():
             tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observation.items()}
-            encoded = self._network.encode(tensors)
-            # One at a time: the bits of a batched product depend on the batch, an episode must not.
-            rows = [
-                self._network.mean_action(encoded.rows(slice(row, row + 1))).numpy()
-                for row in range(len(self._generators))
-            ]
-        actions = np.concatenate(rows)
-        if not self._deterministic:
-            noise = [generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators]
-            actions = actions + self._deviation * np.stack(noise)
-        return np.clip(actions, -1, 1)
-
-
-def load_policy(baseline: str, model: Path | None = None, deterministic: bool = False) -> LearnedBaseline:
-    """The policy of a learned baseline.
-
-    Args:
-        baseline: id, for messages.
-        model: directory that ``tslam-bench baselines train`` wrote.
-        deterministic: act by the mean.
-
-    Raises:
-        InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
-    """
-    command = f"tslam-bench baselines train {baseline} --output {model or 'DIRECTORY'}"
-    if model is None:
-        raise InvalidInputError(
-            f"policy {baseline!r}: needs a trained model; pass its directory, or train one: {command}"
-        )
-    try:
-        network, metadata = read_model(model)
-    except InvalidInputError as error:
-        raise InvalidInputError(f"{error}; train it: {command}") from error
-    config = metadata["config"]
-    mode, repeat = config.get("control_mode"), config.get("action_repeat")
-    if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
-        raise InvalidInputError(
-            f"{model}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
-        )
-    return LearnedBaseline(network, mode, repeat, deterministic)
+            mean, std = self.distribution(tensors)
+        if self._deterministic:
+            return np.clip(mean, -1, 1)
+        noise = np.stack([generator.standard_normal(NUM_JOINTS, dtype=np.float32) for generator in self._generators])
+        if self._noise is not None:
+            correlation = np.float32(self._correlation)
+            noise = correlation * self._noise + np.sqrt(1 - correlation**2) * noise
+        self._noise = noise
+        return np.clip(mean + std * noise, -1, 1)

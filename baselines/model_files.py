@@ -7,7 +7,7 @@ and command.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,14 @@ from tslam_bench.files import atomic_file, write_json
 from .network import NETWORKS, PolicyNetwork
 
 
-def make_network(name: str, initial_std: float = 0.6, seed: int | None = None) -> PolicyNetwork:
+def make_network(
+    name: str,
+    initial_std: float | Sequence[float] = 0.6,
+    seed: int | None = None,
+    state_std: bool = False,
+    clock: int = 0,
+    initial_mean: float | Sequence[float] = 0.0,
+) -> PolicyNetwork:
     """A registered network; its weights are drawn from ``seed``.
 
     Raises:
@@ -30,7 +37,7 @@ def make_network(name: str, initial_std: float = 0.6, seed: int | None = None) -
     if name not in NETWORKS:
         raise InvalidInputError(f"network {name!r}: unknown; choose one of {', '.join(NETWORKS)}")
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    return NETWORKS[name](initial_std, generator)
+    return NETWORKS[name](initial_std, generator, state_std, clock, initial_mean)
 
 
 def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, Any]) -> None:
@@ -53,7 +60,9 @@ def read_model(directory: Path) -> tuple[PolicyNetwork, dict[str, Any]]:
             raise InvalidInputError(f"{directory}: holds no finished model ({name} is missing)")
     try:
         metadata = json.loads((directory / METADATA_FILE).read_text(encoding="utf-8"))
-        network = make_network(metadata["config"]["network"])
+        recipe = metadata["config"]
+        extras = {"state_std": recipe.get("state_std", False), "clock": recipe.get("clock", 0)}
+        network = make_network(recipe["network"], **extras)
         network.load_state_dict(load_file(directory / MODEL_FILE, device="cpu"))
     except Exception as error:  # damaged files fail in json, safetensors or torch
         reason = str(error).strip().splitlines()[0] if str(error).strip() else ""

@@ -10,7 +10,7 @@ policy and value from that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tslam_bench.constants import GRID_SIZE, NUM_JOINTS
+from tslam_bench.constants import GRID_SIZE, NUM_JOINTS, VOXEL_EDGE
 from tslam_bench.hand_constants import JOINT_LIMITS, SKIN_LINKS
 
 GRIDS: Final = 2
@@ -31,13 +31,17 @@ COUNT_SCALE: Final = 0.25
 """Factor on the number of voxels (0 to 8) that are set in a block."""
 
 
+LOG_STD_RANGE: Final = (-4.0, 1.0)
+"""Logarithms of standard deviations are kept within."""
+
+
 @dataclass(frozen=True, eq=False)
 class Encoded:
     """Observations as a rollout buffer keeps them.
 
     Attributes:
-        grid: (n, 8192) uint8, both grids.
-        flat: (n, FLAT_SIZE) float32, of the order of 1.
+        grid: (n, 8192 or more) uint8, both grids.
+        flat: (n, FLAT_SIZE or more) float32, of the order of 1.
     """
 
     grid: Tensor
@@ -68,7 +72,7 @@ class PatchTrunk(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(self._widths, channels, strict=True))
         self.register_buffer("_order", _patch_order(), persistent=False)
 
-    def encode(self, occupancy: Tensor) -> Tensor:
+    def encode(self, occupancy: Tensor, qpos: Tensor) -> Tensor:
         """(n, 2, 32, 32, 32) uint8 -> (n, 8192) uint8, voxels set in each block, patch by patch."""
         pairs = occupancy[:, :, 0::2] + occupancy[:, :, 1::2]
         pairs = (pairs[:, :, :, 0::2] + pairs[:, :, :, 1::2]).view(torch.int16)  # two neighbours along z per number
@@ -81,6 +85,40 @@ class PatchTrunk(nn.Module):
         for layer, width in zip(self.layers, self._widths, strict=True):
             features = layer(features.view(-1, width)).relu_()
         return features.view(len(grid), -1)
+
+
+class HandTrunk(nn.Module):
+    """Two :class:`PatchTrunk`: on the grids as they are, and on the grids moved so that the palm is in their middle.
+
+    What lies left of the index finger is then always in the same place, wherever the hand is. Turns are not undone.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.world, self.hand = PatchTrunk(), PatchTrunk()
+        self.out_features = self.world.out_features + self.hand.out_features
+
+    def encode(self, occupancy: Tensor, qpos: Tensor) -> Tensor:
+        """(n, 2, 32, 32, 32) uint8 and (n, 28) m and rad -> (n, 16384) uint8."""
+        grids = (self.world.encode(occupancy, qpos), self.hand.encode(around_hand(occupancy, qpos), qpos))
+        return torch.cat(grids, dim=1)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """(n, 16384) uint8 -> (n, out_features)."""
+        world, hand = grid.chunk(2, dim=1)
+        return torch.cat([self.world(world.contiguous()), self.hand(hand.contiguous())], dim=1)
+
+
+def around_hand(occupancy: Tensor, qpos: Tensor) -> Tensor:
+    """Grids (n, 2, 32, 32, 32) moved by whole voxels so that their middle is where the arm (n, 28) has the palm; else 0."""
+    arm = qpos[:, :3].float() / VOXEL_EDGE
+    moves = torch.stack([-arm[:, 0], arm[:, 2], arm[:, 1]], dim=1).round().long().clamp(-GRID_SIZE, GRID_SIZE)
+    moved = torch.zeros_like(occupancy)
+    for source, target, move in zip(occupancy, moved, moves.tolist(), strict=True):
+        x, y, z = (slice(max(0, by), GRID_SIZE + min(0, by)) for by in move)
+        u, v, w = (slice(max(0, -by), GRID_SIZE + min(0, -by)) for by in move)
+        target[:, u, v, w] = source[:, x, y, z]
+    return moved
 
 
 class ConvolutionTrunk(nn.Module):
@@ -110,7 +148,7 @@ class ConvolutionTrunk(nn.Module):
         with torch.no_grad():
             self.out_features = self.convolve(torch.zeros(1, GRIDS, *(GRID_SIZE,) * 3)).shape[1]
 
-    def encode(self, occupancy: Tensor) -> Tensor:
+    def encode(self, occupancy: Tensor, qpos: Tensor) -> Tensor:
         """(n, 2, 32, 32, 32) uint8 -> (n, 8192) uint8, eight voxels along z in a byte."""
         bits = occupancy.flatten(1).view(len(occupancy), -1, 8) << self._bit
         return bits.sum(2, dtype=torch.uint8)
@@ -131,32 +169,45 @@ class PolicyNetwork(nn.Module):
     """A Gaussian policy and a value: one trunk for the grids, then an MLP each.
 
     Args:
-        trunk: :class:`PatchTrunk` or :class:`ConvolutionTrunk`.
+        trunk: features of the grids.
         hidden: widths of each MLP's hidden layers.
-        initial_std: standard deviation of the untrained policy, the same for all joints.
+        initial_std: standard deviation of the untrained policy, one for all joints or (28,).
         generator: draws the weights; None leaves torch's own.
+        state_std: the standard deviations depend on the observation, not on the joint alone.
+        clock: so many sine and cosine pairs of the time are inputs too; they turn once, twice, 4, 8, ... times per episode.
+        initial_mean: mean action of the untrained policy, one for all joints or (28,).
     """
 
     _middle: Tensor
     _half_range: Tensor
+    _turns: Tensor
 
     def __init__(
         self,
-        trunk: PatchTrunk | ConvolutionTrunk,
+        trunk: PatchTrunk | HandTrunk | ConvolutionTrunk,
         hidden: tuple[int, ...],
-        initial_std: float = 0.6,
+        initial_std: float | Sequence[float] = 0.6,
         generator: torch.Generator | None = None,
+        state_std: bool = False,
+        clock: int = 0,
+        initial_mean: float | Sequence[float] = 0.0,
     ) -> None:
         super().__init__()
         self.trunk = trunk
-        self.policy = _mlp(trunk.out_features + FLAT_SIZE, hidden, NUM_JOINTS)
-        self.value = _mlp(trunk.out_features + FLAT_SIZE, hidden, 1)
-        self.log_std = nn.Parameter(torch.full((NUM_JOINTS,), float(np.log(initial_std))))
+        features = trunk.out_features + FLAT_SIZE + 2 * clock
+        self.policy = _mlp(features, hidden, NUM_JOINTS * (2 if state_std else 1))
+        self.value = _mlp(features, hidden, 1)
+        self.register_buffer("_turns", 2 * torch.pi * 2.0 ** torch.arange(clock), persistent=False)
+        self.log_std = nn.Parameter(torch.tensor(initial_std).log() + torch.zeros(NUM_JOINTS))
         limits = torch.as_tensor(np.asarray(JOINT_LIMITS, dtype=np.float32))
         self.register_buffer("_middle", limits.mean(dim=1), persistent=False)
         self.register_buffer("_half_range", (limits[:, 1] - limits[:, 0]) / 2, persistent=False)
         if generator is not None:
             self._initialise(generator)
+        output = self.policy[-1]
+        assert isinstance(output, nn.Linear)
+        with torch.no_grad():
+            output.bias[:NUM_JOINTS] += torch.tensor(initial_mean)
 
     def _initialise(self, generator: torch.Generator) -> None:
         """Orthogonal weights. With torch's default a few touched voxels are lost on their way through six layers."""
@@ -169,22 +220,30 @@ class PolicyNetwork(nn.Module):
     def encode(self, observation: Mapping[str, Tensor]) -> Encoded:
         """Entries of protocol section 6, each (n, ...) -> what the other methods take."""
         with torch.no_grad():
+            angles = observation["time"].float() * self._turns
             parts = (
                 (observation["qpos"].float() - self._middle) / self._half_range,
                 observation["qvel"].float() / VELOCITY_SCALE,
                 observation["time"].float(),
                 observation["touch"].float(),
+                angles.sin(),
+                angles.cos(),
             )
-            return Encoded(self.trunk.encode(observation["occupancy"]), torch.cat(parts, dim=1))
+            return Encoded(self.trunk.encode(observation["occupancy"], observation["qpos"]), torch.cat(parts, dim=1))
 
-    def forward(self, inputs: Encoded) -> tuple[Tensor, Tensor]:
-        """Mean actions (n, 28) and values (n,)."""
+    def forward(self, inputs: Encoded) -> tuple[Tensor, Tensor, Tensor]:
+        """Means (n, 28) and logarithms of standard deviations (n, 28) of actions, and values (n,)."""
         features = self._features(inputs)
-        return self.policy(features), self.value(features)[:, 0]
+        return *self._distribution(features), self.value(features)[:, 0]
 
-    def mean_action(self, inputs: Encoded) -> Tensor:
-        """Mean actions (n, 28)."""
-        return self.policy(self._features(inputs))
+    def distribution(self, inputs: Encoded) -> tuple[Tensor, Tensor]:
+        """Means (n, 28) and logarithms of standard deviations (n, 28) of actions."""
+        return self._distribution(self._features(inputs))
+
+    def _distribution(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        mean, *change = self.policy(features).split(NUM_JOINTS, dim=1)
+        log_std = self.log_std.expand_as(mean) if not change else self.log_std + change[0]
+        return mean, log_std.clamp(*LOG_STD_RANGE)
 
     def _features(self, inputs: Encoded) -> Tensor:
         return torch.cat([self.trunk(inputs.grid), inputs.flat], dim=1)
@@ -204,8 +263,9 @@ def _patch_order() -> Tensor:
     return bits.permute(1, 5, 9, 2, 6, 10, 3, 7, 11, 4, 8, 12, 0).flatten()
 
 
-NETWORKS: Final[dict[str, Callable[[float, torch.Generator | None], PolicyNetwork]]] = {
-    "fast": lambda std, generator: PolicyNetwork(PatchTrunk(), (256, 256), std, generator),
-    "paper": lambda std, generator: PolicyNetwork(ConvolutionTrunk(), (256, 256, 256), std, generator),
+NETWORKS: Final[dict[str, Callable[..., PolicyNetwork]]] = {
+    "fast": lambda *arguments: PolicyNetwork(PatchTrunk(), (256, 256), *arguments),
+    "hand": lambda *arguments: PolicyNetwork(HandTrunk(), (256, 256), *arguments),
+    "paper": lambda *arguments: PolicyNetwork(ConvolutionTrunk(), (256, 256, 256), *arguments),
 }
-"""Id -> makes the network from the policy's initial standard deviation and a generator."""
+"""Id -> makes the network from :class:`PolicyNetwork`'s arguments after ``hidden``."""

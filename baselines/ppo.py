@@ -23,6 +23,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
+from tslam_bench.constants import NUM_JOINTS
+
 from .network import Encoded, PolicyNetwork
 from .training_config import TrainingConfig
 
@@ -57,13 +59,13 @@ def advantages(
 
 
 def log_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """(n,) log density of (n, k) actions under independent normals; unclipped actions, as the policy drew them."""
+    """(n, k) log densities of (n, k) actions under independent normals; unclipped actions, as the policy drew them."""
     scaled = (actions - mean) * torch.exp(-log_std)
-    return -(0.5 * scaled.square() + log_std + _HALF_LOG_TAU).sum(-1)
+    return -(0.5 * scaled.square() + log_std + _HALF_LOG_TAU)
 
 
 def policy_loss(log_ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
-    """PPO's clipped surrogate, a scalar to minimise; ``log_ratio`` (n,) is log pi_new - log pi_old."""
+    """PPO's clipped surrogate, a scalar to minimise; ``log_ratio`` is log pi_new - log pi_old, as broad as ``advantage``."""
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
     return -torch.minimum(ratio * advantage, clipped * advantage).mean()
@@ -139,7 +141,9 @@ class PPO:
         self.environments = environments
         self.device = torch.device(device)
         self.network = network.to(self.device)
-        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
+        self._parameters = [network.log_std, *(p for p in network.parameters() if p is not network.log_std)]
+        groups: list[dict[str, Any]] = [{"params": self._parameters[:1]}, {"params": self._parameters[1:]}]
+        self.optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
         self.scale = ReturnScale()
         self.steps = 0
         self.seconds = dict.fromkeys(STAGES, 0.0)
@@ -155,6 +159,7 @@ class PPO:
         self._observation, _ = self.environments.reset(seed=seed % 2**31, options={"reconfigure": True})
         self._sums = torch.zeros(self.environments.num_envs, 1 + len(COUNTS))
         self._discounted = torch.zeros(self.environments.num_envs, device=self.device)
+        self._noise = torch.randn(self.environments.num_envs, NUM_JOINTS, generator=self._generator)
 
     def iterate(self, on_progress: Callable[[int], None] | None = None) -> dict[str, float]:
         """One iteration; returns its figures by name. ``on_progress`` gets the control steps so far.
@@ -182,17 +187,16 @@ class PPO:
 
     # -- collecting -------------------------------------------------------------------------------------------
     def _collect(self, on_progress: Callable[[int], None] | None) -> Rollout:
-        decisions, std = self.config.decisions, self.network.log_std.detach().exp()
+        decisions = self.config.decisions
         kept: list[tuple[Tensor, ...]] = []
         inputs = []
         for _ in range(decisions):
             with self._timed("encode"):
                 inputs.append(self._encode())
             with self._timed("infer"), torch.inference_mode():
-                mean, value = self.network(inputs[-1])
-                noise = torch.randn(mean.shape, generator=self._generator).to(self.device)
-                action = mean + std * noise
-                drawn_with = log_probability(action, mean, self.network.log_std)
+                mean, log_std, value = self.network(inputs[-1])
+                action = mean + log_std.exp() * self._noise.to(self.device)
+                drawn_with = log_probability(action, mean, log_std)
             with self._timed("simulate"):
                 is_numpy = isinstance(self._observation["qpos"], np.ndarray)
                 result = self.environments.step(action.cpu().numpy() if is_numpy else action)
@@ -200,12 +204,18 @@ class PPO:
             end = self._tensor(terminated).bool() | self._tensor(truncated).bool()
             reward = self._tensor(reward).float().clone()  # the environments' memory may be written again
             count = [self._count(info, end, name) for name in COUNTS]
+            reward += self.config.coverage_bonus * count[1]
+            fresh = torch.randn(self._noise.shape, generator=self._generator)
+            correlation = (
+                self.config.noise_correlation * ~end.cpu()[:, None]
+            )  # the next episode begins with other noise
+            self._noise = correlation * self._noise + (1 - correlation**2).sqrt() * fresh
             kept.append((action, drawn_with, value, reward, end, torch.stack(count, dim=1)))
             self.steps += self.config.action_repeat * self.environments.num_envs
             if on_progress is not None:
                 on_progress(self.steps)
         with torch.inference_mode():
-            _, last_value = self.network(self._encode())
+            *_, last_value = self.network(self._encode())
         actions, log_probabilities, values, rewards, ended, counts = map(torch.stack, zip(*kept, strict=True))
         encoded = Encoded(torch.stack([i.grid for i in inputs]), torch.stack([i.flat for i in inputs]))
         return Rollout(encoded, actions, log_probabilities, values, rewards, ended, counts, last_value)
@@ -257,10 +267,14 @@ class PPO:
         samples = Samples(
             Encoded(rollout.inputs.grid.flatten(0, 1), rollout.inputs.flat.flatten(0, 1)),
             rollout.actions.flatten(0, 1),
-            rollout.log_probability.flatten(),
+            rollout.log_probability.flatten(0, 1),
             ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).flatten(),
             target.flatten(),
         )
+        done = (self.steps - config.iteration_steps) / config.total_steps
+        left = 1 - (1 - config.final_learning_rate) * min(1.0, done)
+        for group, factor in zip(self.optimizer.param_groups, (config.std_learning_rate, 1.0), strict=True):
+            group["lr"] = config.learning_rate * left * factor
         figures: dict[str, float] = {}
         for epoch in range(config.epochs):
             sums = torch.zeros(4, device=self.device)
@@ -272,8 +286,9 @@ class PPO:
             figures["epochs"] = epoch + 1
             if figures["approximate_kl"] > config.target_kl:
                 break
-        log_std = self.network.log_std.detach()
-        figures["entropy"] = float((log_std + 0.5 + _HALF_LOG_TAU).sum())
+        with torch.inference_mode():
+            _, log_std = self.network.distribution(samples.inputs.rows(slice(None, None, 8)))  # a few are enough
+        figures["entropy"] = float((log_std + 0.5 + _HALF_LOG_TAU).sum(1).mean())
         figures["std"] = float(log_std.exp().mean())
         figures["explained_variance"] = explained
         return figures
@@ -292,7 +307,7 @@ class PPO:
         parts = chosen.tensor_split(self._parts)
         results = list(self._pool.map(lambda part: self._gradients(samples.rows(part)), parts))
         shares = [len(part) / len(chosen) for part in parts]
-        for index, parameter in enumerate(self.network.parameters()):
+        for index, parameter in enumerate(self._parameters):
             parameter.grad = _sum(
                 share * gradients[index] for share, (gradients, _) in zip(shares, results, strict=True)
             )
@@ -302,17 +317,22 @@ class PPO:
 
     def _gradients(self, samples: Samples) -> tuple[tuple[Tensor, ...], Tensor]:
         """Gradients of the loss by every parameter, and :meth:`_update`'s figures."""
-        config, log_std = self.config, self.network.log_std
-        mean, value = self.network(samples.inputs)
-        log_ratio = log_probability(samples.actions, mean, log_std) - samples.log_probability
-        surrogate = policy_loss(log_ratio, samples.advantage, config.clip_range)
+        config = self.config
+        mean, log_std, value = self.network(samples.inputs)
+        each = log_probability(samples.actions, mean, log_std) - samples.log_probability
+        log_ratio = each.sum(1)
+        if config.clip_each_joint:
+            surrogate = NUM_JOINTS * policy_loss(each, samples.advantage[:, None], config.clip_range)
+        else:
+            surrogate = policy_loss(log_ratio, samples.advantage, config.clip_range)
         value_loss = (value - samples.target).square().mean()
-        loss = surrogate + config.value_coefficient * value_loss - config.entropy_coefficient * log_std.sum()
-        gradients = torch.autograd.grad(loss, list(self.network.parameters()))
+        loss = surrogate + config.value_coefficient * value_loss - config.entropy_coefficient * log_std.sum(1).mean()
+        gradients = torch.autograd.grad(loss, self._parameters)
         with torch.no_grad():
             change = torch.expm1(log_ratio)
             kl = (change - log_ratio).mean()  # http://joschu.net/blog/kl-approx.html
-            clipped = change.abs().gt(config.clip_range).float().mean()
+            ratios = torch.expm1(each) if config.clip_each_joint else change
+            clipped = ratios.abs().gt(config.clip_range).float().mean()
             return gradients, torch.stack([surrogate, value_loss, kl, clipped])
 
     @contextmanager

@@ -23,17 +23,19 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch.utils.tensorboard import SummaryWriter
 
-from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
+from tslam_bench.hand_constants import ARM_JOINTS, JOINT_NAMES
 from tslam_bench.machine import processor_name
 from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.registration import make_vec
 from tslam_bench.version import __version__
 
 from .model_files import make_network, write_model
+from .network import PolicyNetwork
 from .ppo import PPO
 from .training_config import PAPER_STEPS, TrainingConfig
 
@@ -83,7 +85,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
     threads = torch.get_num_threads()
     environments = make_training_environments(config)
     try:
-        network = make_network(config.network, config.initial_std, config.seed)
+        network = untrained_network(config)
         learner = PPO(config, environments, network, learning_device(config))
         if checkpoint is not None and state is not None:
             tensors = torch.load(checkpoint / CHECKPOINT_TENSORS, map_location=learner.device, weights_only=True)
@@ -123,6 +125,17 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
     write_model(output, network, metadata)
     shutil.rmtree(output / "checkpoints", ignore_errors=True)
     return metadata
+
+
+def untrained_network(config: TrainingConfig) -> PolicyNetwork:
+    """The policy that a run begins with; its weights are drawn from the run's seed."""
+    arm = [JOINT_NAMES.index(name) for name in ARM_JOINTS[:3]]
+    std = np.full(NUM_JOINTS, config.initial_std, dtype=np.float32)
+    std[arm] = config.initial_arm_std
+    mean = np.zeros(NUM_JOINTS, dtype=np.float32)
+    if config.control_mode == "pd_joint_pos":  # where the palm rests on what lies in the workspace
+        mean[arm] = config.initial_aim
+    return make_network(config.network, std.tolist(), config.seed, config.state_std, config.clock, mean.tolist())
 
 
 def make_training_environments(config: TrainingConfig) -> VectorEnv:

@@ -16,7 +16,7 @@ PAPER_STEPS: Final = 10_000_000
 """Training budget of the paper, in environment steps."""
 
 
-NetworkName = Literal["fast", "paper"]
+NetworkName = Literal["fast", "hand", "paper"]
 ControlMode = Literal["pd_joint_pos", "pd_joint_delta_pos"]
 
 
@@ -39,9 +39,19 @@ class TrainingConfig:
     action_repeat: int = 4
     """Control steps that each action is held for; a divisor of the episode's 200."""
     network: NetworkName = "fast"
-    """Policy network; fast: matrix products for a CPU; paper: six 3D convolutions."""
-    initial_std: float = 0.6
-    """Standard deviation of the untrained policy; an action of 1 is a joint's limit."""
+    """Policy network; fast: matrix products for a CPU; hand: the same, and again around the hand; paper: six 3D convolutions."""
+    clock: int = 5
+    """Sine and cosine pairs of the time among the network's inputs, turning once, twice, 4, 8, ... times per episode."""
+    initial_std: float = 1.0
+    """Standard deviation of the untrained policy in fingers, wrist and roll; an action of 1 is a joint's limit."""
+    initial_arm_std: float = 0.3
+    """The same of the arm's three translations."""
+    initial_aim: tuple[float, float, float] = (0.0, -0.4, 0.2)
+    """Mean action of the untrained policy for the arm: sideways, up, forward; of ``pd_joint_pos`` only."""
+    state_std: bool = False
+    """The standard deviations depend on the observation; else on the joint alone."""
+    noise_correlation: float = 0.0
+    """Correlation of the policy's noise in one decision with that in the next of an episode; 0: independent."""
     num_envs: int = 32
     """Environments that are stepped side by side."""
     rollout_steps: int = HORIZON
@@ -54,12 +64,20 @@ class TrainingConfig:
     """No further pass once the approximate KL divergence from the policy that acted exceeds this."""
     learning_rate: float = 3e-4
     """Adam's step size."""
+    final_learning_rate: float = 1.0
+    """Share of the step size that is left at the end, reached linearly."""
+    std_learning_rate: float = 1.0
+    """Factor on the step size of the standard deviations that depend on the joint alone."""
     gamma: float = 0.97
     """Discount per decision; 0.97 per 4 control steps is 0.992 per control step (paper: 0.99)."""
     gae_lambda: float = 0.95
     """Decay of generalised advantage estimation."""
     clip_range: float = 0.2
     """PPO's clip of the probability ratio."""
+    clip_each_joint: bool = False
+    """Each joint's probability ratio is clipped by itself, not their product."""
+    coverage_bonus: float = 0.0
+    """Added to the reward for each newly visited voxel while learning, beside what the baseline's reward pays."""
     value_coefficient: float = 0.5
     """Weight of the value's squared error."""
     entropy_coefficient: float = 0.0
@@ -86,12 +104,19 @@ class TrainingConfig:
         ):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
-        for name in ("initial_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
+        for name in ("initial_std", "initial_arm_std", "target_kl", "learning_rate", "clip_range", "max_gradient"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be a number above 0")
-        for name in ("value_coefficient", "entropy_coefficient"):
+        if not all(-1 <= value <= 1 for value in self.initial_aim):
+            raise InvalidInputError(f"initial_aim {self.initial_aim}: actions must lie in [-1, 1]")
+        if not 0 <= self.clock <= 6:
+            raise InvalidInputError(f"clock {self.clock}: must lie in [0, 6]")  # the next turns faster than a step
+        for name in ("value_coefficient", "entropy_coefficient", "std_learning_rate", "coverage_bonus"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must not be negative")
+        for name in ("noise_correlation", "final_learning_rate"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InvalidInputError(f"{name} {getattr(self, name)}: must lie in [0, 1]")
         if self.processes is not None and self.processes < 1:
             raise InvalidInputError(f"processes {self.processes}: must be at least 1")
         if self.seed < 0:

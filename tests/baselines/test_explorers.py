@@ -144,6 +144,8 @@ def spoil(kind: str, folder: Path) -> None:
         record["config"]["control_mode"] = "torque"
     elif kind == "endless":
         record["config"]["action_repeat"] = 0
+    elif kind == "other noise":
+        record["config"]["noise_correlation"] = 1.5
     metadata.write_text(json.dumps(record) if kind != "no json" else "{")
 
 
@@ -156,12 +158,13 @@ def spoil(kind: str, folder: Path) -> None:
         ("torch archive", "cannot be read"),
         ("header of 2^60 bytes", "cannot be read"),
         ("other network", "cannot be read"),
-        ("unknown network", "unknown; choose one of fast, paper"),
+        ("unknown network", "unknown; choose one of fast, hand, paper"),
         ("not finite", "not finite"),
         ("no recipe", "cannot be read"),
         ("no json", "cannot be read"),
         ("other mode", "control_mode 'torque'"),
         ("endless", "action_repeat 0"),
+        ("other noise", "noise_correlation 1.5"),
     ],
 )
 def test_damaged_or_hostile_model_is_one_line_and_runs_no_code(kind: str, message: str, policy, tmp_path) -> None:
@@ -344,7 +347,7 @@ def test_learned_agrees_with_the_network_it_was_made_from(policy) -> None:
     baseline = make("learned mean", policy)
     baseline.reset(3, 0)
     with torch.no_grad():
-        mean, _ = policy(policy.encode({key: torch.from_numpy(value) for key, value in seen.items()}))
+        mean, *_ = policy(policy.encode({key: torch.from_numpy(value) for key, value in seen.items()}))
     assert np.allclose(baseline.act(seen), mean.clamp(-1, 1), atol=1e-5)
 
 
@@ -360,3 +363,23 @@ def test_learned_holds_each_action_and_then_looks_again(policy) -> None:
         assert np.array_equal(actions[first], every.act(observation(qpos[first])))  # the same noise per decision
     assert not np.array_equal(actions[0], actions[4])
     assert baseline.control_mode == "pd_joint_pos"
+
+
+def test_learned_noise_is_as_broad_and_as_correlated_as_it_says(policy) -> None:
+    """By signs and medians, which the clip at +-1 leaves alone."""
+    count, steps, correlation = 50, 40, 0.7
+    drawn = LearnedBaseline(policy, "pd_joint_pos", 1, noise_correlation=correlation)
+    still = observation(np.repeat(start(1), count, axis=0))
+    centre = LearnedBaseline(policy, "pd_joint_pos", deterministic=True)
+    centre.reset(count, 0)
+    mean = centre.act(still)
+    assert np.abs(mean).max() < 0.5
+    drawn.reset(count, 0)
+    noise = np.stack([drawn.act(still) for _ in range(steps)]) - mean
+    pairs = np.stack([noise[:-1], noise[1:]]).reshape(2, -1)
+    deviation = float(policy.log_std.detach().exp()[0])
+    quadrants = (np.sign(pairs[0]) == np.sign(pairs[1])).mean()
+    assert quadrants == pytest.approx(0.5 + np.arcsin(correlation) / np.pi, abs=0.01)  # of two such normals
+    assert np.median(np.abs(noise)) / deviation == pytest.approx(0.6745, abs=0.02)
+    drawn.reset(count, 0)
+    assert np.array_equal(drawn.act(still) - mean, noise[0])  # an episode begins with fresh noise

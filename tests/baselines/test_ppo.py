@@ -14,13 +14,14 @@ from gymnasium import spaces
 from torch import nn
 
 from tslam_bench.baselines.model_files import make_network
-from tslam_bench.baselines.network import NETWORKS, ConvolutionTrunk, PatchTrunk
+from tslam_bench.baselines.network import NETWORKS, ConvolutionTrunk, Encoded, PatchTrunk, around_hand
 from tslam_bench.baselines.ppo import PPO, ReturnScale, advantages, log_probability, policy_loss
 from tslam_bench.baselines.training_config import TrainingConfig
-from tslam_bench.constants import GRID_SIZE, NUM_JOINTS
+from tslam_bench.constants import GRID_SIZE, NUM_JOINTS, VOXEL_EDGE
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import SKIN_LINKS
 
+ARM_AT_REST = torch.zeros(3, NUM_JOINTS)
 GENERATOR = np.random.Generator(np.random.PCG64(5))
 
 
@@ -66,7 +67,7 @@ def test_advantages_are_the_weighted_sum_of_all_multi_step_estimates() -> None:
 
 def test_log_probability_is_torchs_own() -> None:
     actions, mean, log_std = (torch.from_numpy(GENERATOR.normal(size=(6, 4))) for _ in range(3))
-    expected = torch.distributions.Normal(mean, log_std[0].exp()).log_prob(actions).sum(1)
+    expected = torch.distributions.Normal(mean, log_std[0].exp()).log_prob(actions)
     torch.testing.assert_close(log_probability(actions, mean, log_std[0]), expected)
 
 
@@ -110,14 +111,31 @@ def test_patches_are_convolutions_that_do_not_overlap() -> None:
             kernel = layer.weight.view(layer.out_features, 2, 2, 2, width).permute(0, 4, 1, 2, 3)
             grid = torch.relu(nn.functional.conv3d(grid, kernel, layer.bias, stride=2))
             width = layer.out_features
-        features = trunk(trunk.encode(occupancy)).view(3, 2, 2, 2, 4).permute(0, 4, 1, 2, 3)
+        features = trunk(trunk.encode(occupancy, ARM_AT_REST)).view(3, 2, 2, 2, 4).permute(0, 4, 1, 2, 3)
     torch.testing.assert_close(features, grid, rtol=1e-4, atol=1e-5)
+
+
+def test_grids_around_the_hand_are_moved_by_the_arm() -> None:
+    """Voxel by voxel: what lies at the palm's place in the world comes to the middle, what leaves the grid is lost."""
+    occupancy = observation(3, GENERATOR)["occupancy"].clone()
+    occupancy[:, :, ::2] = 0
+    arm = np.array([[0.05, 0.0, 0.0], [-0.11, 0.06, 0.2], [0.25, 0.25, -0.3]])  # sideways, up, forward (m)
+    qpos = torch.zeros(3, NUM_JOINTS)
+    qpos[:, :3] = torch.from_numpy(arm)
+    palm = np.round(np.stack([-arm[:, 0], arm[:, 2], arm[:, 1]], axis=1) / VOXEL_EDGE).astype(int)  # world x, y, z
+    expected = np.zeros_like(occupancy.numpy())
+    for n, channel, *voxel in np.argwhere(occupancy.numpy()):
+        x, y, z = voxel - palm[n]
+        if min(x, y, z) >= 0 and max(x, y, z) < GRID_SIZE:
+            expected[n, channel, x, y, z] = 1
+    assert expected[0].any() and expected[1].any() and not expected[2].any()
+    assert np.array_equal(around_hand(occupancy, qpos).numpy(), expected)
 
 
 def test_paper_network_gets_the_grids_bit_by_bit() -> None:
     trunk = ConvolutionTrunk()
     occupancy = observation(3, GENERATOR)["occupancy"]
-    encoded = trunk.encode(occupancy)
+    encoded = trunk.encode(occupancy, ARM_AT_REST)
     assert encoded.shape == (3, 8192) and encoded.dtype == torch.uint8
     assert torch.equal(encoded, torch.from_numpy(np.packbits(occupancy.numpy(), axis=-1, bitorder="little")).flatten(1))
     with torch.no_grad():
@@ -135,11 +153,11 @@ def test_networks_start_as_they_should(name: str) -> None:
         assert "weight" not in key or not torch.equal(weight, different), key
     with torch.no_grad():
         encoded = one.encode(observation(5, GENERATOR))
-        mean, value = one(encoded)
+        mean, _, value = one(encoded)
     assert mean.shape == (5, NUM_JOINTS) and value.shape == (5,)
     assert mean.abs().max() < 0.3 and torch.allclose(one.log_std.exp(), torch.tensor(0.5))
-    torch.testing.assert_close(one.mean_action(encoded), mean)
-    with pytest.raises(InvalidInputError, match=r"network 'huge': unknown; choose one of fast, paper"):
+    torch.testing.assert_close(one.distribution(encoded)[0], mean)
+    with pytest.raises(InvalidInputError, match=r"network 'huge': unknown; choose one of fast, hand, paper"):
         make_network("huge")
 
 
@@ -151,7 +169,7 @@ def test_a_few_touched_voxels_reach_the_features(name: str) -> None:
     grids[1, 0, 10:14, 12:20, 12] = 1
     trunk = make_network(name, seed=3).trunk
     with torch.no_grad():
-        features = trunk(trunk.encode(grids))
+        features = trunk(trunk.encode(grids, ARM_AT_REST[:2]))
     assert (features[1] - features[0]).norm() > 0.02 * features[0].norm()
 
 
@@ -207,7 +225,8 @@ CONFIG = TrainingConfig(
 
 
 def train(config: TrainingConfig, tensors: bool, iterations: int) -> tuple[PPO, list[float]]:
-    learner = PPO(config, Bandit(config.num_envs, tensors), make_network("fast", 0.4, seed=0), "cpu")
+    network = make_network("fast", 0.4, 0, config.state_std)
+    learner = PPO(config, Bandit(config.num_envs, tensors), network, "cpu")
     learner.begin(3)
     returns = []
     for _ in range(iterations):
@@ -216,14 +235,15 @@ def train(config: TrainingConfig, tensors: bool, iterations: int) -> tuple[PPO, 
     return learner, returns
 
 
-def test_it_learns_what_touch_and_grids_ask_for() -> None:
-    learner, returns = train(CONFIG, True, 60)
+@pytest.mark.parametrize("change", [{}, {"clip_each_joint": True}, {"state_std": True}, {"noise_correlation": 0.5}])
+def test_it_learns_what_touch_and_grids_ask_for(change: dict[str, Any]) -> None:
+    learner, returns = train(replace(CONFIG, **change), True, 60)
     assert returns[0] < -7  # noise of 0.4 and a miss of 0.5 on two joints: -(0.16 + 0.25) * 2 * 10 = -8.2
     assert returns[-1] > -3.5  # the noise alone costs -3.2 at first
     assert learner.steps == 60 * 16 * 40
     learner.environments.reset(seed=1)
     with torch.no_grad():
-        mean = learner.network.mean_action(learner.network.encode(learner.environments.buffers))  # type: ignore[attr-defined]
+        mean, _ = learner.network.distribution(learner.network.encode(learner.environments.buffers))  # type: ignore[attr-defined]
     asked = learner.environments.asked  # type: ignore[attr-defined]
     assert (mean[:, :2] - asked).abs().mean() < 0.15
 
@@ -272,3 +292,55 @@ def test_a_policy_that_moved_too_far_gets_no_further_pass() -> None:
     learner = PPO(replace(CONFIG, target_kl=1e-3), Bandit(16, True), make_network("fast", 0.4, seed=0), "cpu")
     learner.begin(3)
     assert learner.iterate()["epochs"] == 1
+
+
+def test_step_sizes_shrink_linearly_and_by_group() -> None:
+    config = replace(CONFIG, steps=4 * 640, final_learning_rate=0.2, std_learning_rate=10.0)
+    learner = PPO(config, Bandit(16, True), make_network("fast", 0.4, seed=0), "cpu")
+    learner.begin(3)
+    used = []
+    for _ in range(4):
+        learner.iterate()
+        used.append([group["lr"] for group in learner.optimizer.param_groups])
+    expected = 2e-3 * np.array([1.0, 0.8, 0.6, 0.4])
+    np.testing.assert_allclose(used, np.stack([10 * expected, expected], axis=1))
+
+
+def test_noise_is_correlated_within_an_episode_and_not_across() -> None:
+    """Bandit's episodes have ten decisions."""
+    config = replace(CONFIG, noise_correlation=0.8, rollout_steps=160, num_envs=64)
+    learner = PPO(config, Bandit(64, True), make_network("fast", 0.4, seed=0), "cpu")
+    learner.begin(3)
+    rollout = learner._collect(None)
+    with torch.no_grad():
+        mean, _, _ = learner.network(Encoded(rollout.inputs.grid.flatten(0, 1), rollout.inputs.flat.flatten(0, 1)))
+    noise = ((rollout.actions - mean.view(rollout.actions.shape)) / 0.4).numpy()
+    assert noise.std() == pytest.approx(1, abs=0.03)
+    for lag, correlation in ((1, 0.8), (3, 0.512)):
+        products = [(noise[t] * noise[t + lag]).mean() for t in range(40 - lag) if t // 10 == (t + lag) // 10]
+        assert np.mean(products) / noise.var() == pytest.approx(correlation, abs=0.02)
+    across = [(noise[t] * noise[t + 1]).mean() for t in (9, 19, 29)]
+    assert np.mean(across) == pytest.approx(0, abs=0.05)
+
+
+def test_coverage_bonus_is_added_to_the_reward() -> None:
+    class Visiting(Bandit):
+        def step(self, action):
+            *rest, info = super().step(action)
+            visited = 3 + torch.arange(16)
+            if "final_info" in info:  # where an episode ended, the step's count is there
+                info["final_info"]["new_visited"] = visited
+                return *rest, info | {"new_visited": visited * ~info["_final_info"]}
+            return *rest, info | {"new_visited": visited}
+
+    plain, paid = (
+        PPO(replace(CONFIG, coverage_bonus=bonus), Visiting(16, True), make_network("fast", 0.4, seed=0), "cpu")
+        for bonus in (0.0, 0.5)
+    )
+    for learner in (plain, paid):
+        learner.begin(3)
+        learner.iterate()
+    difference = np.array(
+        [b["return"] - a["return"] for a, b in zip(plain.episodes[:16], paid.episodes[:16], strict=True)]
+    )
+    np.testing.assert_allclose(np.sort(difference), 10 * 0.5 * (3 + np.arange(16)), rtol=1e-4)

@@ -24,6 +24,7 @@ from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.evaluate import EvaluationConfig, evaluate, make_reconstructors
 from tslam_bench.evaluation.policies import MODEL_FILE, make_baseline
 from tslam_bench.files import CACHE_VARIABLE
+from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.scoring.submission import read_submission
 
 CONFIG = TrainingConfig(
@@ -210,6 +211,11 @@ def test_every_parameter_is_trained(straight: Path, tmp_path: Path) -> None:
         ({"gamma": 1.5}, "gamma"),
         ({"learning_rate": float("nan")}, "learning_rate nan"),
         ({"initial_std": 0.0}, "initial_std 0.0"),
+        ({"initial_arm_std": -0.3}, "initial_arm_std -0.3"),
+        ({"initial_aim": (0.0, -1.4, 0.0)}, r"initial_aim \(0.0, -1.4, 0.0\)"),
+        ({"clock": 7}, "clock 7"),
+        ({"noise_correlation": -0.1}, "noise_correlation -0.1"),
+        ({"final_learning_rate": 1.1}, "final_learning_rate 1.1"),
         ({"entropy_coefficient": -1.0}, "entropy_coefficient -1.0"),
         ({"rollout_steps": 30}, "rollout_steps 30: must be a multiple of action_repeat 20"),
         ({"action_repeat": 3, "rollout_steps": 201}, "action_repeat 3: must divide the 200 steps"),
@@ -256,6 +262,43 @@ def test_the_paper_network_trains_in_the_other_control_mode(tmp_path: Path) -> N
     config = replace(CONFIG, network="paper", control_mode="pd_joint_delta_pos", steps=400)
     assert train(config, tmp_path)["control_mode"] == "pd_joint_delta_pos"
     assert make_baseline("tslam", tmp_path).control_mode == "pd_joint_delta_pos"
+
+
+@pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_joint_delta_pos"])
+def test_an_untrained_policy_aims_and_scatters_as_it_is_told(mode: str) -> None:
+    """Absolute targets of the arm are drawn around the aim; differences around standing still."""
+    config = replace(
+        CONFIG, control_mode=mode, initial_std=0.9, initial_arm_std=0.2, initial_aim=(0.1, -0.4, 0.3), clock=3
+    )
+    network = training.untrained_network(config)
+    seen = {
+        "qpos": torch.zeros(4, 28),
+        "qvel": torch.zeros(4, 28),
+        "touch": torch.zeros(4, len(SKIN_LINKS), dtype=torch.uint8),
+        "occupancy": torch.zeros(4, 2, 32, 32, 32, dtype=torch.uint8),
+        "time": torch.linspace(0, 1, 4)[:, None],
+    }
+    with torch.no_grad():
+        mean, log_std = network.distribution(network.encode(seen))
+    aim = [0.1, -0.4, 0.3] if mode == "pd_joint_pos" else [0.0, 0.0, 0.0]
+    expected = torch.tensor([*aim, *[0.0] * 25])
+    assert torch.allclose(mean, expected.expand_as(mean), atol=0.1)
+    assert torch.allclose(log_std.exp(), torch.tensor([*[0.2] * 3, *[0.9] * 25]).expand_as(mean))
+
+
+def test_the_clock_turns_twice_as_often_with_each_pair() -> None:
+    network = training.untrained_network(replace(CONFIG, clock=3))
+    time = np.array([0.0, 0.1, 0.7], dtype=np.float32)
+    empty = {
+        "qpos": torch.zeros(3, 28),
+        "qvel": torch.zeros(3, 28),
+        "touch": torch.zeros(3, len(SKIN_LINKS), dtype=torch.uint8),
+        "occupancy": torch.zeros(3, 2, 32, 32, 32, dtype=torch.uint8),
+        "time": torch.from_numpy(time)[:, None],
+    }
+    flat = network.encode(empty).flat.numpy()[:, -6:]
+    angles = 2 * np.pi * time[:, None] * [1, 2, 4]
+    np.testing.assert_allclose(flat, np.concatenate([np.sin(angles), np.cos(angles)], axis=1), atol=1e-5)
 
 
 def test_rounding_of_budgets() -> None:

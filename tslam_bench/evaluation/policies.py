@@ -43,7 +43,7 @@ def _learned(identifier: str, reward_mode: str, summary: str) -> PolicySpec:
     return PolicySpec(
         identifier,
         summary,
-        "tslam_bench.baselines.learned_policy:load_policy",  # brings torch
+        "tslam_bench.baselines.learned_policy:LearnedBaseline.load",  # brings torch
         {"baseline": identifier},
         kind="learned",
         reward_mode=reward_mode,

@@ -89,7 +89,7 @@ class TrainingConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto: on a CUDA GPU where there is one (not run on a GPU yet)."""
     processes: int | None = None
-    """Worker processes that simulate on the CPU; default: the cores. Results do not depend on it."""
+    """Worker processes that simulate on the CPU; default: the cores; 0: none but the trainer. Results do not depend on it."""
     torch_threads: int = 2
     """Threads that share each minibatch out while a CPU learns; the simulation waits then."""
 
@@ -117,8 +117,8 @@ class TrainingConfig:
         for name in ("noise_correlation", "final_learning_rate"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must lie in [0, 1]")
-        if self.processes is not None and self.processes < 1:
-            raise InvalidInputError(f"processes {self.processes}: must be at least 1")
+        if self.processes is not None and self.processes < 0:
+            raise InvalidInputError(f"processes {self.processes}: must not be negative")
         if self.seed < 0:
             raise InvalidInputError(f"seed {self.seed}: must not be negative")
         if HORIZON % self.action_repeat:

@@ -39,7 +39,7 @@ ARRAYS: Final = {
 """Arrays of a file; the two grids are packed (:func:`tslam_bench.grids.pack`)."""
 OBJECT_NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}"
 """Pattern of an object's name in a file's name."""
-_FORMAT_1: Final = {
+_FORMAT_1: Final[dict[tuple[str, ...], str]] = {
     ("actions", "touched", "touched_step", "visited"): (
         "rollout format 1, which has no joint checkpoints; remove it and explore again with this version"
     )

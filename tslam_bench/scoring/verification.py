@@ -163,7 +163,7 @@ class VerificationRecord:
     def write(self, path: Path) -> None:
         """Writes the record with its seal. Raises AssetError if the file or the key cannot be written."""
         content = {"record_version": RECORD_VERSION, "protocol_version": PROTOCOL_VERSION, **dataclasses.asdict(self)}
-        write_json(path, {**content, "seal": _seal(content, _key(make=True))})
+        write_json(path, {**content, "seal": _seal(content, _made_key())})
 
     @staticmethod
     def read(path: Path) -> VerificationRecord:
@@ -180,7 +180,7 @@ class VerificationRecord:
             seal = content.pop("seal")
             if content["record_version"] != RECORD_VERSION or content["protocol_version"] != PROTOCOL_VERSION:
                 raise InvalidInputError(f"{path}: a verification record of another version; {remedy}")
-            key = _key(make=False)
+            key = _key()
             if key is None or not hmac.compare_digest(str(seal), _seal(content, key)):
                 raise InvalidInputError(f"{path}: not made here, or changed since; {remedy}")
             fields = {k: v for k, v in content.items() if k not in ("record_version", "protocol_version", "verdicts")}
@@ -226,12 +226,13 @@ def pack_steps(touched_step: NDArray[np.int16]) -> str:
 def unpack_steps(text: str) -> NDArray[np.int16]:
     """Inverse of :func:`pack_steps`. Raises InvalidInputError for anything else."""
     try:
-        data = zlib.decompressobj().decompress(base64.b64decode(text, validate=True), 3 * _VOXELS)
+        stream = zlib.decompressobj()
+        data = stream.decompress(base64.b64decode(text, validate=True), 3 * _VOXELS + 1)
     except (ValueError, zlib.error) as error:
         raise InvalidInputError(f"verification record: damaged touches ({error}); run verify again") from error
     count = len(data) // 3
     voxels, steps = np.frombuffer(data[: 2 * count], "<u2"), np.frombuffer(data[2 * count :], np.uint8)
-    if len(data) != 3 * count or (voxels >= _VOXELS).any() or (steps >= HORIZON).any():
+    if not stream.eof or len(data) != 3 * count or (voxels >= _VOXELS).any() or (steps >= HORIZON).any():
         raise InvalidInputError("verification record: touches outside the grid or the episode; run verify again")
     flat = np.full(_VOXELS, -1, dtype=np.int16)
     flat[voxels] = steps
@@ -242,17 +243,24 @@ def _seal(content: Mapping[str, Any], key: bytes) -> str:
     return hmac.new(key, json.dumps(content, sort_keys=True).encode(), "sha256").hexdigest()
 
 
-def _key(make: bool) -> bytes | None:
-    """The key of this user's records; with ``make`` it is drawn if there is none."""
+def _key() -> bytes | None:
+    """The key of this user's records, or None if none was made here yet."""
     path = cache_directory() / KEY_FILE
     try:
-        if make and not path.is_file():
-            ensure_writable_directory(path.parent)
-            with (
-                contextlib.suppress(FileExistsError),  # somebody else was faster
-                os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream,
-            ):
-                stream.write(secrets.token_bytes(32))
         return path.read_bytes() if path.is_file() else None
+    except OSError as error:
+        raise AssetError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def _made_key() -> bytes:
+    """The key of this user's records; it is drawn if there is none."""
+    path = ensure_writable_directory(cache_directory()) / KEY_FILE
+    try:
+        with (
+            contextlib.suppress(FileExistsError),
+            os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream,
+        ):
+            stream.write(secrets.token_bytes(32))
+        return path.read_bytes()
     except OSError as error:
         raise AssetError(f"{path}: cannot be read or written ({error.strerror}); check its permissions") from error

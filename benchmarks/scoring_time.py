@@ -71,7 +71,8 @@ def write_submission(folder: Path, kind: str, items: list[PreparedObject], seeds
                     world = grids.object_to_world(found, pose)
                     steps = np.where(world, generator.integers(0, 200, world.shape), -1).astype(np.int16)
                     actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
-                    writer.add_rollout(Rollout(item.name, pose, seed, actions, world, ~world, steps))
+                    joints = np.zeros((21, 28), np.float32)
+                    writer.add_rollout(Rollout(item.name, pose, seed, actions, world, ~world, steps, joints))
                     touched[pose] = found
                 for count, poses in RECONSTRUCTED_POSES.items():
                     merged = grids.merge(touched[pose] for pose in poses)

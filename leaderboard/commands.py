@@ -20,6 +20,7 @@ from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.score_file import SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import INFO_FILE, Submission, read_submission
+from tslam_bench.scoring.verification import find_record
 
 from .page import build_page
 from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
@@ -148,19 +149,25 @@ def plan_pictures(
 def _score_missing(
     scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int
 ) -> list[SubmissionScore]:
-    """Adds scores of submissions that have none; a score of other assets or of another version does not count."""
-    current = [score for score in scores if score.content_hash not in submissions or _is_current(score)]
+    """Adds scores of submissions that have none; one of other assets, or from before the replay beside them, does not count."""
+    current = [score for score in scores if _is_current(score, submissions.get(score.content_hash))]
     scored = {score.content_hash for score in current}
+    before = {score.content_hash: score.objects for score in scores}
     missing = [submission for key, submission in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for submission in missing:
             with Progress(f"score {Path(submission.location).name}", "object", leave=False) as bar:
-                current.append(score_submission(submission, None, pool, bar.show))
+                objects = before.get(submission.content_hash)
+                current.append(score_submission(submission, objects, pool, bar.show))
     return current
 
 
-def _is_current(score: SubmissionScore) -> bool:
+def _is_current(score: SubmissionScore, submission: Submission | None) -> bool:
+    if submission is None:
+        return True
     try:
+        if not score.verified and find_record(submission, score.objects)[0] is not None:
+            return False
         return score.asset_sha256 == asset_sha256(score.objects)
     except AssetError:
         return True  # the objects are not here: the score is the best there is

@@ -62,7 +62,9 @@ def write_submission(
                 found = world & (generator.random(world.shape) < share)
                 steps = np.where(found, generator.integers(0, 200, world.shape), -1).astype(np.int16)
                 actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
-                writer.add_rollout(Rollout(name, pose, 0, actions, found, ~world, steps))
+                writer.add_rollout(
+                    Rollout(name, pose, 0, actions, found, ~world, steps, np.zeros((21, 28), np.float32))
+                )
                 touched[pose] = grids.world_to_object(found, pose)
             for count, poses in RECONSTRUCTED_POSES.items():
                 merged = grids.merge(touched[pose] for pose in poses)

@@ -52,15 +52,18 @@ def play(env: gym.Env, policy: Policy, name: str, pose: int, seed: int, salt: st
     """One episode in an environment of ``gymnasium.make``."""
     policy.reset(1, [policy_seed(salt, (name, pose, seed))])
     observation, _ = env.reset(seed=episode_seed(pose, seed), options={"object": name, "pose": pose})
-    actions, ended = [], False
+    actions, joints, ended = [], [to_numpy(observation["qpos"])[0]], False
     while not ended:
         actions.append(policy.act(observation_to_numpy(observation))[0])
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         ended = bool(terminated) or bool(truncated)
+        if len(actions) % 10 == 0:
+            joints.append(to_numpy(observation["qpos"])[0])
     base = env.unwrapped
     touched, visited, touched_step = (to_numpy(grid)[0] for grid in (base.touched, base.visited, base.touched_step))
     steps = touched_step.astype(np.int16)
-    return Rollout(name, pose, seed, np.stack(actions), touched.astype(bool), visited.astype(bool), steps)
+    grids = touched.astype(bool), visited.astype(bool), steps
+    return Rollout(name, pose, seed, np.stack(actions), *grids, np.stack(joints).astype(np.float32))
 
 
 @pytest.fixture(scope="module")

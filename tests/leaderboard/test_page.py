@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 import time
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -21,6 +22,9 @@ from tslam_bench.errors import AssetError
 from tslam_bench.leaderboard.commands import find_inputs, page_main
 from tslam_bench.leaderboard.page import build_page
 from tslam_bench.leaderboard.ranking import rank
+from tslam_bench.objects.store import asset_sha256
+from tslam_bench.scoring.submission import read_submission
+from tslam_bench.scoring.verification import Verdict, VerificationRecord, pack_steps, record_path
 
 
 @pytest.fixture(autouse=True)
@@ -178,6 +182,34 @@ def test_page_shows_the_scores(page: Path, run: Path) -> None:
         assert entry["aggregate"]["areas"]["iou_area"]["mean"] == pytest.approx(mean)
         assert f">{mean:.3f}<" in text
     assert "12,345" in text and "a toaster" in text and "not replayed" in text and "privileged" in text
+
+
+def test_a_record_beside_a_submission_makes_it_a_replayed_one(run: Path, tmp_path: Path) -> None:
+    """The older score is not kept. A stranger's record, which has another seal, changes nothing."""
+    folder = shutil.copytree(run / "submissions" / "random-grid", tmp_path / "submissions" / "random-grid")
+    submission = read_submission(folder)
+    verdicts = []
+    for name, pose, seed in submission.episodes():
+        rollout = submission.rollout(name, pose, seed)
+        assert rollout is not None
+        lied = (name, pose) == ("mug", 3)
+        verdicts.append(
+            Verdict(name, pose, seed, *(("joints", 9) if lied else (None, None)), pack_steps(rollout.touched_step))
+        )
+    assets = {name: asset_sha256([name]) for name in NAMES}
+    how = {"mode": "bits", "tolerances": {}, "package_version": "1", "processor": "a", "simulator": "b"}
+    record = VerificationRecord(submission.content_hash, assets, verdicts=tuple(verdicts), **how)  # type: ignore[arg-type]
+    record.write(record_path(folder))
+    sealed = record_path(folder).read_text()
+    record_path(folder).write_text(sealed.replace('"step": 9', '"step": 19'))
+    scores = str(run / "scores" / "random-grid.json")
+    for expected in (False, True):
+        page_main([scores, str(folder), "--output", str(tmp_path / "page"), "--pictured", "0"])
+        (entry,) = json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]
+        text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
+        assert entry["verified"] is expected and (">replayed<" in text) is expected
+        assert ("mug, pose 3, seed 0: joints depart by step 9" in text) is expected
+        record_path(folder).write_text(sealed)
 
 
 def test_page_is_deterministic_and_reuses_pictures(page: Path, run: Path, tmp_path: Path) -> None:

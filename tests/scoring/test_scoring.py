@@ -68,7 +68,7 @@ def explored(box, pose: int, share: float, seed: int) -> Rollout:
     touched = world & (generator.random(world.shape) < share)
     actions = generator.uniform(-1, 1, (200, 28)).astype(np.float32)
     steps = np.where(touched, generator.integers(0, 200, world.shape), -1).astype(np.int16)
-    return Rollout(box.name, pose, seed, actions, touched, ~world, steps)
+    return Rollout(box.name, pose, seed, actions, touched, ~world, steps, np.zeros((21, 28), np.float32))
 
 
 def submission(folder: Path, box, info: SubmissionInfo = INFO, skip: tuple[str, ...] = ()) -> Submission:

@@ -58,6 +58,7 @@ def rollout_arrays(seed: int = 0) -> dict[str, np.ndarray]:
         "touched": touched_step >= 0,
         "visited": generator.random((32, 32, 32)) < 0.1,
         "touched_step": touched_step,
+        "joint_checkpoints": generator.uniform(-1, 1, (21, 28)).astype(np.float32),
     }
 
 
@@ -97,7 +98,7 @@ def refused(path: Path, *fragments: str) -> None:
 def packed_rollout(**changes: np.ndarray) -> dict[str, np.ndarray]:
     arrays = rollout_arrays()
     arrays["touched"], arrays["visited"] = grids.pack(arrays["touched"]), grids.pack(arrays["visited"])
-    return arrays | changes
+    return {"format": np.array(2, np.int16), **arrays, **changes}
 
 
 # --- Round trips -----------------------------------------------------------------------------------------------
@@ -182,6 +183,8 @@ def test_another_submission_is_not_overwritten(folder: Path, change: dict) -> No
         ({"actions": np.full((200, 28), np.nan, np.float32)}, "NaN"),
         ({"actions": np.full((200, 28), 1.01, np.float32)}, "leave \\[-1, 1\\]"),
         ({"touched": np.zeros((32, 32, 32), bool)}, "disagree"),
+        ({"joint_checkpoints": np.zeros((20, 28), np.float32)}, "expected \\(21, 28\\) float32"),
+        ({"joint_checkpoints": np.full((21, 28), np.inf, np.float32)}, "joint_checkpoints hold NaN"),
         ({"touched_step": np.full((32, 32, 32), 200, np.int16)}, "outside"),
         ({"visited": np.zeros((32, 32), bool)}, "visited"),
         ({"object": "../mug"}, "not the name of a rollout"),
@@ -245,7 +248,7 @@ def test_a_rollout_is_copied_where_links_are_not_allowed(tmp_path: Path, monkeyp
 @pytest.mark.parametrize(
     ("changes", "fragments"),
     [
-        ({"schema_version": 2}, ["schema_version is 2"]),
+        ({"schema_version": 1}, ["schema_version is 1", "SubmissionWriter"]),
         ({"protocol_version": 99}, ["protocol_version is 99"]),
         ({"protocol_version": "1"}, ["protocol_version is '1'"]),
         ({"environment_id": "TactileSLAM-Tabletop-v0"}, ["environment_id"]),
@@ -339,6 +342,8 @@ def test_privileged_declared_is_accepted(folder: Path) -> None:
         ({"touched_step": np.zeros((32, 32, 32), np.int32)}, ["touched_step"]),
         ({"actions": np.array([{"a": 1}], dtype=object)}, ["pickled"]),
         ({"more": np.zeros(3)}, ["expected the arrays"]),
+        ({"format": np.array(3, np.int16)}, ["rollout format 3, this version reads 2"]),
+        ({"joint_checkpoints": np.full((21, 28), np.nan, np.float32)}, ["joint_checkpoints hold NaN"]),
     ],
 )
 def test_bad_rollout_files_are_refused(folder: Path, changes: dict, fragments: list[str]) -> None:
@@ -351,6 +356,13 @@ def test_rollout_without_an_array_is_refused(folder: Path) -> None:
     del arrays["visited"]
     np.savez_compressed(folder / ROLLOUT, **arrays)  # type: ignore[arg-type]
     refused(folder, ROLLOUT, "expected the arrays")
+
+
+def test_rollouts_of_format_1_are_told_apart(folder: Path) -> None:
+    arrays = packed_rollout()
+    del arrays["format"], arrays["joint_checkpoints"]
+    np.savez_compressed(folder / ROLLOUT, **arrays)  # type: ignore[arg-type]
+    refused(folder, ROLLOUT, "rollout format 1, which has no joint checkpoints", "explore again")
 
 
 @pytest.mark.parametrize(

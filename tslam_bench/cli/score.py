@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +20,8 @@ from tslam_bench.files import write_json
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
+from tslam_bench.scoring.submission import Submission, read_submission
+from tslam_bench.scoring.verification import VerificationRecord
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class ScoreArguments:
     """JSON file for the scores; with several submissions, a folder that gets one file each, as soon as it is scored."""
     objects: tuple[str, ...] = ()
     """Objects to score; empty: those of the submission's object set."""
+    verification: tuple[Path, ...] = ()
+    """Records of tslam-bench verify, one for each submission that has one; default: SUBMISSION.verification.json beside it."""
     workers: int = 1
     """Processes."""
     json: bool = False
@@ -49,11 +53,13 @@ def score_main(arguments: Sequence[str]) -> None:
         raise InvalidInputError("score: name at least one submission, a folder or a zip archive")
     check_workers(parsed.workers)
     files = _score_files(parsed.submissions, parsed.output)
+    submissions, records = _with_records(parsed.submissions, parsed.verification)
     scores = []
     with worker_pool(parsed.workers) as pool:
-        for path, file in zip(parsed.submissions, files, strict=True):
+        for path, file, submission in zip(parsed.submissions, files, submissions, strict=True):
             with Progress(f"score {path.name}", "object", leave=False) as bar:
-                scores.append(score_submission(path, parsed.objects or None, pool, bar.show))
+                record = records.get(submission.content_hash)
+                scores.append(score_submission(submission, parsed.objects or None, pool, bar.show, record=record))
             if file is not None:
                 write_json(file, scores[-1].to_json())
     if parsed.json:
@@ -69,6 +75,27 @@ def score_main(arguments: Sequence[str]) -> None:
             console.print(object_table(score))
         for note in score.notes:
             console.print(f"[yellow]note[/] {escape(f'{score.info.method}: {note}')}", highlight=False)
+
+
+def _with_records(
+    paths: Sequence[Path], record_files: Sequence[Path]
+) -> tuple[Iterable[Submission], dict[str, VerificationRecord]]:
+    """The submissions, read when their turn comes, and the records by content hash; each is of one of the submissions.
+
+    Raises:
+        InvalidInputError: a record is not to be trusted, or is of other files. Known before hours of scoring, not after.
+    """
+    submissions: Iterable[Submission] = map(read_submission, paths)
+    if not record_files:
+        return submissions, {}
+    submissions = list(submissions)
+    records = {}
+    for file in record_files:
+        record = VerificationRecord.read(file)
+        if record.content_hash not in {submission.content_hash for submission in submissions}:
+            raise InvalidInputError(f"{file}: made for other files than the given submissions; run verify again")
+        records[record.content_hash] = record
+    return submissions, records
 
 
 def summary_table(scores: Sequence[SubmissionScore]) -> Table:

@@ -79,14 +79,22 @@ class HandBatch:
         settings: what they are.
         arrays: the arrays of :func:`batch_arrays`, each (K, ...); actions are read from them, all else is written there. None
             makes them.
+        autoreset: whether an episode that ends is followed by the next one at once; else it stays as it is until the next reset.
     """
 
-    def __init__(self, num_envs: int, settings: BatchSettings, arrays: Mapping[str, NDArray] | None = None) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        settings: BatchSettings,
+        arrays: Mapping[str, NDArray] | None = None,
+        autoreset: bool = True,
+    ) -> None:
         if arrays is None:
             arrays = {name: np.zeros((num_envs, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()}
         hand, backend = load_hand(), NumpyBackend()
         self.num_envs = num_envs
         self.arrays = arrays
+        self._autoreset = autoreset
         self._starts = settings.sampler()
         table = self._starts.variant.table
         self._scenes = settings.scenes(hand.urdf, settings.physics, table, num_envs)
@@ -168,10 +176,10 @@ class HandBatch:
         arrays["touch"][:] = self._sensing.link_touch()
         arrays["time"][:, 0] = arrays["elapsed_steps"] / np.float32(HORIZON)
         ended = np.flatnonzero(arrays["elapsed_steps"] >= HORIZON)
-        if len(ended):
+        arrays["truncated"][:] = False
+        arrays["truncated"][ended] = True
+        if len(ended) and self._autoreset:
             self._start_anew(ended)
-        else:
-            arrays["truncated"][:] = False
 
     def _start_anew(self, ended: NDArray) -> None:
         arrays, kept = self.arrays, {}
@@ -182,8 +190,13 @@ class HandBatch:
         self.reset([None] * len(ended), ended.tolist())
         for name, value in kept.items():
             arrays[name][ended] = value
-        arrays["truncated"][:] = False
-        arrays["truncated"][ended] = True
+        arrays["truncated"][ended] = True  # the reset cleared it
+
+    def put_joints(self, qpos: NDArray[np.float32]) -> None:
+        """Moves all joints to ``qpos`` (K, 28) within the running episodes; velocities stay. The next step feels from there."""
+        for scene, row in zip(self._scenes, qpos, strict=True):
+            scene.put_joints(row)
+        self.arrays["qpos"][:] = qpos
 
     def _read(self, envs: Sequence[int]) -> None:
         """Reads joints and links of ``envs`` from their scenes."""

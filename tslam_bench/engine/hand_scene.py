@@ -82,6 +82,10 @@ class HandScene:
         self._robot.set_qf(np.zeros_like(qpos))
         self.set_targets(start.qpos.tolist())
 
+    def put_joints(self, qpos: NDArray[np.float32]) -> None:
+        """Moves the joints to ``qpos`` (28,), in the order of ``JOINT_NAMES``; their velocities stay."""
+        self._robot.set_qpos(qpos[self._from_order])
+
     def step(self) -> None:
         """One control step."""
         for _ in range(self.settings.substeps):

@@ -13,7 +13,7 @@ from tslam_bench.episodes import Episode, episode_seed, policy_seed
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.observations import last_observation, observation_to_numpy, to_numpy
 from tslam_bench.evaluation.policy import Policy
-from tslam_bench.scoring.rollout import Rollout
+from tslam_bench.scoring.rollout import CHECKPOINT_SPACING, CHECKPOINTS, Rollout
 
 
 def roll_out_batch(envs: VectorEnv, baseline: Policy, episodes: Sequence[Episode], salt: str) -> list[Rollout]:
@@ -40,6 +40,8 @@ def roll_out_batch(envs: VectorEnv, baseline: Policy, episodes: Sequence[Episode
     options = {"object": [name for name, _, _ in filled], "pose": [pose for _, pose, _ in filled]}
     raw, _ = envs.reset(seed=starts, options=options)
     actions = np.zeros((HORIZON, envs.num_envs, NUM_JOINTS), dtype=np.float32)
+    joints = np.zeros((envs.num_envs, CHECKPOINTS, NUM_JOINTS), dtype=np.float32)
+    joints[:, 0] = to_numpy(raw["qpos"])
     touched_step = np.full((envs.num_envs, *(GRID_SIZE,) * 3), -1, dtype=np.int16)
     for step in range(HORIZON):
         actions[step] = baseline.act(observation_to_numpy(raw))
@@ -47,11 +49,14 @@ def roll_out_batch(envs: VectorEnv, baseline: Policy, episodes: Sequence[Episode
         ended = to_numpy(terminated) | to_numpy(truncated)
         if ended.any() != (step == HORIZON - 1) or ended.any() != ended.all():
             raise InvalidInputError(f"environment: an episode ended after {step + 1} steps, expected {HORIZON}")
-        occupancy = to_numpy(last_observation(raw, info)["occupancy"]).astype(bool)
+        now = last_observation(raw, info)
+        occupancy = to_numpy(now["occupancy"]).astype(bool)
         touched_step[occupancy[:, 0] & (touched_step < 0)] = step
+        if (step + 1) % CHECKPOINT_SPACING == 0:
+            joints[:, (step + 1) // CHECKPOINT_SPACING] = to_numpy(now["qpos"])
     rollouts = []
     for env, (name, pose, seed) in enumerate(episodes):
         touched, visited = occupancy[env]
         taken = actions[:, env].copy()
-        rollouts.append(Rollout(name, pose, int(seed), taken, touched, visited, touched_step[env]))
+        rollouts.append(Rollout(name, pose, int(seed), taken, touched, visited, touched_step[env], joints[env]))
     return rollouts

@@ -21,8 +21,8 @@ from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.plugins import IDENTIFIER
 
-SCHEMA_VERSION: Final = 1
-"""Version of the submission format."""
+SCHEMA_VERSION: Final = 2
+"""Version of the submission format. 2: rollouts hold joint checkpoints."""
 OBJECT_SETS: Final = ("quick", "test")
 """What a submission covers: the five quick objects or the whole test split."""
 

@@ -21,6 +21,7 @@ from tslam_bench.scoring.prediction import prepare
 from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.score_file import CURVE_SPACING, ObjectScore
 from tslam_bench.scoring.submission import EXPLORATION_ORDER, RECONSTRUCTED_POSES, Reconstruction, Submission
+from tslam_bench.scoring.verification import VerificationRecord
 
 VOXEL_HALF_DIAGONAL: Final = VOXEL_EDGE * np.sqrt(3) / 2
 PLAUSIBLE_SLACK: Final = 2e-3
@@ -63,10 +64,13 @@ def load_truth(name: str, cache: Path | None = None) -> Truth:
     return Truth.of(load_object(name, cache=cache))
 
 
-def score_object(submission: Submission, truth: Truth) -> list[ObjectScore]:
-    """Scores of one object, one per seed of the submission."""
+def score_object(submission: Submission, truth: Truth, record: VerificationRecord | None = None) -> list[ObjectScore]:
+    """Scores of one object, one per seed of the submission.
+
+    With a ``record`` of a replay, touches are the replay's, and an episode that did not reproduce counts as untouched.
+    """
     scorer = _Scorer(truth)
-    return [_score_seed(submission, scorer, seed) for seed in submission.info.seeds]
+    return [_score_seed(submission, scorer, seed, record) for seed in submission.info.seeds]
 
 
 class _Scorer:
@@ -88,12 +92,15 @@ def _same(first: Volume, second: Volume) -> bool:
     return first.interpolation == second.interpolation and np.array_equal(first.probability, second.probability)
 
 
-def _score_seed(submission: Submission, scorer: _Scorer, seed: int) -> ObjectScore:
+def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: VerificationRecord | None) -> ObjectScore:
     truth = scorer.truth
     name = truth.prepared.name
     rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
     reference = submission.info.privileged and not any(rollouts.values())
     missing = [] if reference else [f"rollout of pose {pose}" for pose, rollout in rollouts.items() if rollout is None]
+    stored = {pose for pose, rollout in rollouts.items() if rollout is not None}
+    if record is not None:
+        rollouts = {p: None if rollout is None else record.replayed(rollout) for p, rollout in rollouts.items()}
     touched_step = merge_touched_steps(rollouts)
 
     total = HORIZON * len(EXPLORATION_ORDER)
@@ -112,7 +119,9 @@ def _score_seed(submission: Submission, scorer: _Scorer, seed: int) -> ObjectSco
         if reconstruction is None:
             missing.append(f"reconstruction of {count} pose{'s' if count > 1 else ''}")
         elif absent and not reference:
-            reason = f"rollouts of poses {', '.join(map(str, absent))} are missing"
+            why = "did not reproduce" if stored.issuperset(absent) else "are missing or did not reproduce"
+            why = "are missing" if stored.isdisjoint(absent) else why
+            reason = f"rollouts of poses {', '.join(map(str, absent))} {why}"
             reconstruction = None
         shape, found = scorer.score(reconstruction)
         poses[str(count)] = {**shape, **(dict.fromkeys(touch) if reference else touch)}

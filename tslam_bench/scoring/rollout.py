@@ -1,6 +1,7 @@
 """One episode and its file, the same in a run's folder and in a submission (protocol section 12).
 
-The file ``<object>/pose<k>_seed<s>.npz`` holds the arrays of :data:`ARRAYS`; its name tells the episode.
+The file ``<object>/pose<k>_seed<s>.npz`` holds the arrays of :data:`ARRAYS`; its name tells the episode. Format 1, which had
+no joint checkpoints, is refused.
 """
 
 from __future__ import annotations
@@ -21,15 +22,28 @@ from tslam_bench.files import atomic_file
 from tslam_bench.grids import pack, unpack
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 
+ROLLOUT_FORMAT: Final = 2
+"""Version of a file's content."""
+CHECKPOINT_SPACING: Final = 10
+"""Control steps between the joint checkpoints."""
+CHECKPOINTS: Final = HORIZON // CHECKPOINT_SPACING + 1
+"""Joint checkpoints of an episode, with the one before the first step."""
 ARRAYS: Final = {
+    "format": Expected("int16", ()),
     "actions": Expected("float32", (HORIZON, NUM_JOINTS)),
     "touched": Expected("uint8", (GRID_SIZE**3 // 8,)),
     "visited": Expected("uint8", (GRID_SIZE**3 // 8,)),
     "touched_step": Expected("int16", (GRID_SIZE,) * 3),
+    "joint_checkpoints": Expected("float32", (CHECKPOINTS, NUM_JOINTS)),
 }
 """Arrays of a file; the two grids are packed (:func:`tslam_bench.grids.pack`)."""
 OBJECT_NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}"
 """Pattern of an object's name in a file's name."""
+_FORMAT_1: Final[dict[tuple[str, ...], str]] = {
+    ("actions", "touched", "touched_step", "visited"): (
+        "rollout format 1, which has no joint checkpoints; remove it and explore again with this version"
+    )
+}
 _FILE: Final = re.compile(rf"({OBJECT_NAME})/pose([0-7])_seed(0|[1-9][0-9]{{0,9}})\.npz")
 
 
@@ -54,6 +68,8 @@ class Rollout:
         touched: (32, 32, 32) bool, voxels touched by the end.
         visited: (32, 32, 32) bool, voxels visited by the end.
         touched_step: (32, 32, 32) int16, control step (from 0) at which a voxel was first touched, -1 for never.
+        joint_checkpoints: (21, 28) float32, joint positions (m, rad) as observed before the first step and after every tenth,
+            in the order of ``JOINT_NAMES``: for replays and players.
 
     Raises:
         InvalidInputError: no such pose or name, shapes, data types or values are wrong, or ``touched_step`` and ``touched``
@@ -67,6 +83,7 @@ class Rollout:
     touched: NDArray[np.bool_]
     visited: NDArray[np.bool_]
     touched_step: NDArray[np.int16]
+    joint_checkpoints: NDArray[np.float32]
 
     def __post_init__(self) -> None:
         if parse_rollout_file(self.file) is None:
@@ -77,6 +94,7 @@ class Rollout:
             ("touched", np.bool_, grid),
             ("visited", np.bool_, grid),
             ("touched_step", np.int16, grid),
+            ("joint_checkpoints", np.float32, (CHECKPOINTS, NUM_JOINTS)),
         ):
             value = np.asarray(getattr(self, name))
             if value.shape != shape or value.dtype != dtype:
@@ -86,6 +104,8 @@ class Rollout:
             raise InvalidInputError("actions hold NaN or infinite values; store the actions that were executed")
         if np.abs(self.actions).max() > 1:
             raise InvalidInputError("actions leave [-1, 1]; clip them before they are executed and stored")
+        if not np.isfinite(self.joint_checkpoints).all():
+            raise InvalidInputError("joint_checkpoints hold NaN or infinite values; store the observed joint positions")
         if ((self.touched_step < -1) | (self.touched_step >= HORIZON)).any():
             raise InvalidInputError(f"touched_step holds values outside -1..{HORIZON - 1}")
         if not np.array_equal(self.touched_step >= 0, self.touched):
@@ -101,10 +121,12 @@ class Rollout:
         stream = io.BytesIO()
         np.savez_compressed(
             stream,
+            format=np.int16(ROLLOUT_FORMAT),
             actions=self.actions,
             touched=pack(self.touched),
             visited=pack(self.visited),
             touched_step=self.touched_step,
+            joint_checkpoints=self.joint_checkpoints,
         )
         return stream.getvalue()
 
@@ -117,12 +139,18 @@ class Rollout:
             where: the file's name for messages.
 
         Raises:
-            InvalidInputError: truncated, pickled, arrays missing or unknown, or not a rollout.
+            InvalidInputError: of another format, truncated, pickled, arrays missing or unknown, or not a rollout.
         """
-        arrays = read_npz(data, ARRAYS, where)
+        arrays = read_npz(data, ARRAYS, where, _FORMAT_1)
+        if arrays["format"] != ROLLOUT_FORMAT:
+            raise InvalidInputError(
+                f"{where}: rollout format {arrays['format']}, this version reads {ROLLOUT_FORMAT}; explore again with it"
+            )
         touched, visited = unpack(arrays["touched"]), unpack(arrays["visited"])
         try:
-            return cls(*episode, arrays["actions"], touched, visited, arrays["touched_step"])
+            return cls(
+                *episode, arrays["actions"], touched, visited, arrays["touched_step"], arrays["joint_checkpoints"]
+            )
         except InvalidInputError as error:
             raise InvalidInputError(f"{where}: {error}") from error
 

@@ -1,6 +1,6 @@
 """Scores of a submission: every object, seed and number of poses, then aggregated (protocol sections 10 and 12).
 
-Rollouts are not replayed: a score says ``verified: false`` until something has simulated the stored actions again.
+Scoring simulates nothing. A score says ``verified: true`` if a record of a replay, made here of these very files, is behind it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from tslam_bench.scoring.aggregate import Estimate, estimate_all
 from tslam_bench.scoring.measure import load_truth, score_object
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, Submission, read_submission
+from tslam_bench.scoring.verification import VerificationRecord, find_record
 
 FULL_ENTRY_SEEDS: Final = 3
 """Fewest seeds of a full entry on the test split."""
@@ -47,6 +48,7 @@ def score_submission(
     pool: ProcessPoolExecutor | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     cache: Path | None = None,
+    record: VerificationRecord | None = None,
 ) -> SubmissionScore:
     """Scores a submission against the prepared objects of the asset cache.
 
@@ -56,17 +58,25 @@ def score_submission(
         pool: processes that score objects (:func:`worker_pool`); the result does not depend on it.
         on_progress: called with (done, all) objects.
         cache: asset cache; by default the user's.
+        record: what a replay of its rollouts found; by default the record beside the submission, if there is one to be trusted.
 
     Raises:
-        InvalidInputError: the submission is refused or has changed since it was read, or an object is unknown.
+        InvalidInputError: the submission is refused or has changed since it was read, an object is unknown, or ``record`` is of
+            other files or assets.
         AssetError: an object is not prepared.
     """
     if not isinstance(submission, Submission):
         submission = read_submission(submission)
     names = tuple(dict.fromkeys(resolve_name(name) for name in (objects or object_set(submission.info.object_set))))
+    if record is None:
+        record, remark = find_record(submission, names, cache)
+    else:
+        record.check(submission, names, "verification record", cache)
+        remark = None
     parts = [submission.of_object(name) for name in names]
+    records = [record and record.of_object(name) for name in names]
     results: list[ObjectScore] = []
-    scored = (pool.map if pool else map)(_score_part, parts, names, [cache] * len(names))
+    scored = (pool.map if pool else map)(_score_part, parts, names, records, [cache] * len(names))
     for done, scores in enumerate(scored, start=1):
         results += scores
         if on_progress:
@@ -78,12 +88,15 @@ def score_submission(
         asset_sha256=asset_sha256(names, cache=cache),
         results=tuple(results),
         aggregate=aggregate(results, len(names)),
-        notes=_notes(submission, results, names, cache),
+        notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record)),
+        verified=record is not None,
     )
 
 
-def _score_part(part: Submission, name: str, cache: Path | None) -> list[ObjectScore]:
-    return score_object(part, load_truth(name, cache))
+def _score_part(
+    part: Submission, name: str, record: VerificationRecord | None, cache: Path | None
+) -> list[ObjectScore]:
+    return score_object(part, load_truth(name, cache), record)
 
 
 def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:
@@ -103,9 +116,13 @@ def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[st
 
 
 def _notes(
-    submission: Submission, results: Sequence[ObjectScore], names: Sequence[str], cache: Path | None
+    submission: Submission,
+    results: Sequence[ObjectScore],
+    names: Sequence[str],
+    cache: Path | None,
+    record: VerificationRecord | None,
 ) -> tuple[str, ...]:
-    notes = []
+    notes = [] if record is None else [record.summary()]
     if tuple(names) != object_set(submission.info.object_set):
         notes.append(f"scored on chosen objects ({len(names)}), not on the object set {submission.info.object_set!r}")
     if submission.info.object_set == "test" and len(submission.info.seeds) < FULL_ENTRY_SEEDS:

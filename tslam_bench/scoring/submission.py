@@ -79,6 +79,10 @@ class Submission:
         self._source = source
         self._digests = digests
 
+    def episodes(self) -> list[Episode]:
+        """The episodes whose rollouts it holds, sorted."""
+        return sorted(episode for name in self._digests if (episode := _episode(name)) is not None)
+
     def of_object(self, object_name: str) -> Submission:
         """The same submission with the files of one object only: less to send to another process."""
         own = {name: digest for name, digest in self._digests.items() if _object_of(name) == object_name}

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import IO
 
 import numpy as np
@@ -49,12 +50,18 @@ class Expected:
         return f"({shape}) {'text' if self.dtype == 'U' else self.dtype}{limit}"
 
 
-def read_npz(data: bytes, expected: Mapping[str, Expected], where: str) -> dict[str, NDArray]:
+def read_npz(
+    data: bytes,
+    expected: Mapping[str, Expected],
+    where: str,
+    known: Mapping[tuple[str, ...], str] = MappingProxyType({}),
+) -> dict[str, NDArray]:
     """Arrays of an ``.npz`` file that holds exactly the ``expected`` ones.
 
     Args:
         data: the file's bytes.
         where: the file's name for messages.
+        known: sorted names of other arrays that a file may hold -> what to say of such a file.
 
     Raises:
         InvalidInputError: truncated, pickled, arrays missing or unknown, wrong data type or shape.
@@ -64,7 +71,10 @@ def read_npz(data: bytes, expected: Mapping[str, Expected], where: str) -> dict[
             names = archive.namelist()
             wanted = {f"{name}.npy": name for name in expected}
             if sorted(names) != sorted(wanted):
-                found = ", ".join(sorted(n.removesuffix(".npy") for n in names[:8])) or "nothing"
+                held = tuple(sorted(n.removesuffix(".npy") for n in names[:8]))
+                if held in known:
+                    raise InvalidInputError(f"{where}: {known[held]}")
+                found = ", ".join(held) or "nothing"
                 raise InvalidInputError(f"{where}: holds {found[:120]!r}; expected the arrays {', '.join(expected)}")
             return {wanted[name]: _read_array(archive, name, expected[wanted[name]], where) for name in names}
     except InvalidInputError:

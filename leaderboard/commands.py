@@ -15,9 +15,9 @@ from tslam_bench.cli.progress import Progress
 from tslam_bench.cli.score import check_workers
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_file, ensure_writable_directory, write_json
+from tslam_bench.files import atomic_file, check_output, ensure_writable_directory, write_json
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.score_file import SubmissionScore
+from tslam_bench.scoring.score_file import SubmissionScore, is_score_file
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import INFO_FILE, Submission, read_submission
 from tslam_bench.scoring.verification import find_record
@@ -71,7 +71,7 @@ def page_main(arguments: Sequence[str]) -> None:
     for path in submission_paths:
         submission = read_submission(path)
         submissions.setdefault(submission.content_hash, submission)
-    ensure_writable_directory(parsed.output)  # before hours of scoring, not after
+    _check_output(parsed.output)  # before hours of scoring, not after
     scores = _score_missing(scores, submissions, parsed.workers)
     leaderboard = rank(scores)
 
@@ -90,6 +90,18 @@ def page_main(arguments: Sequence[str]) -> None:
         return
     entries = sum(len(table["entries"]) for table in leaderboard["tables"])
     print(f"{parsed.output / PAGE_FILE}: {entries} entries, {len(html.encode()) / 2**20:.1f} MiB")
+
+
+def _check_output(folder: Path) -> None:
+    """Raises a BenchmarkError unless a page can be written to ``folder`` without destroying anything but an older page."""
+    ensure_writable_directory(folder)
+    page, data = folder / PAGE_FILE, folder / DATA_FILE
+    if (folder / INFO_FILE).exists():
+        raise InvalidInputError(f"--output {folder}: is a submission; choose another folder")
+    if page.exists() and not data.exists():
+        raise InvalidInputError(f"{page}: is not a leaderboard's page and stays; choose another folder")
+    for path in (page, data):
+        check_output(path)
 
 
 def find_inputs(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -113,7 +125,7 @@ def find_inputs(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                 for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
                     if (entry / INFO_FILE).is_file() or (entry.suffix == ".zip" and zipfile.is_zipfile(entry)):
                         submissions[entry] = None
-                    elif entry.suffix == ".json" and _is_score_file(entry):
+                    elif entry.suffix == ".json" and is_score_file(entry):
                         scores[entry] = None
     return list(scores), list(submissions)
 
@@ -171,14 +183,6 @@ def _is_current(score: SubmissionScore, submission: Submission | None) -> bool:
         return score.asset_sha256 == asset_sha256(score.objects)
     except AssetError:
         return True  # the objects are not here: the score is the best there is
-
-
-def _is_score_file(path: Path) -> bool:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(value, dict) and "score_version" in value
 
 
 def _read_score(path: Path) -> SubmissionScore:

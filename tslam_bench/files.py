@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
 import shutil
+import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from tslam_bench.errors import AssetError
+from tslam_bench.errors import AssetError, InvalidInputError
 
 CACHE_VARIABLE = "TSLAM_BENCH_CACHE"
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""What a disk says that takes no more, whoever writes to it."""
+_TAKEN: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES)
+"""What a system says of a directory that is to be put where one stands."""
+_KINDS: Final = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+}
+_MOST_RIVALS: Final = 1000
+"""Others that may put a directory in the same place at the same time before writing it is given up."""
 
 
 def cache_directory() -> Path:
@@ -69,17 +84,81 @@ def sha256_file(path: Path) -> str:
     return digest.hexdigest()
 
 
+def kind_of_file(mode: int) -> str:
+    """What a path leads to, by its ``st_mode``: "a file", "a folder", "a pipe", ..."""
+    return _KINDS.get(stat.S_IFMT(mode), "a file" if stat.S_ISREG(mode) else "something unknown")
+
+
+def place_to_write(path: Path, directory: bool = False) -> Path:
+    """Where a file (or directory) ``path`` is written: the path itself, or what it leads to if it is a link.
+
+    Raises:
+        InvalidInputError: a device, a pipe, a folder (or a file) stands there, which is not to be replaced.
+        AssetError: the path cannot be looked at.
+    """
+    with _one_line(path):
+        place = Path(os.path.realpath(path))
+        try:
+            mode = place.stat().st_mode
+        except FileNotFoundError:
+            return place
+    if not (stat.S_ISDIR(mode) if directory else stat.S_ISREG(mode)):
+        wanted = "folder" if directory else "file"
+        raise InvalidInputError(f"{path}: is {kind_of_file(mode)}, no {wanted}, and stays; name another {wanted}")
+    return place
+
+
+def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """Looks at where a result is going to be written, before the work and not after it.
+
+    Raises:
+        InvalidInputError: no file is to be written there, or it is one of the ``inputs`` or lies in one.
+        AssetError: the path cannot be looked at.
+    """
+    place = place_to_write(path)
+    for given in inputs:
+        read = Path(os.path.realpath(given))
+        if read == place or read in place.parents:
+            raise InvalidInputError(f"{path}: would be written into {given}, which is read; name another place")
+
+
+@contextlib.contextmanager
+def _one_line(path: Path, errors: tuple[int, ...] | None = None) -> Iterator[None]:
+    """Turns what the system refuses (only ``errors``, if they are named) into one line that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if errors is not None and error.errno not in errors:
+            raise
+        reason = error.strerror or str(error)
+        raise AssetError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
+
+
+def _hidden(path: Path, ending: str = "") -> str:
+    """Prefix of the name of something temporary beside ``path``, whose own name may be as long as a name can be."""
+    return f".{path.stem[:40]}{ending}-"
+
+
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary path in the target's folder; on success it replaces ``path``, on failure it is removed."""
-    ensure_writable_directory(path.parent)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    """Yields a temporary path beside the target; on success it replaces ``path``, on failure it is removed.
+
+    Raises:
+        InvalidInputError: something that is no file stands there.
+        AssetError: the place cannot be written, or is full.
+    """
+    target = place_to_write(path)
+    ensure_writable_directory(target.parent)
+    with _one_line(path):
+        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=_hidden(target), suffix=target.suffix[:20])
     os.close(descriptor)
     temporary = Path(name)
     try:
-        yield temporary
-        temporary.chmod(0o644)
-        temporary.replace(path)
+        with _one_line(path, _NO_ROOM):
+            yield temporary
+        with _one_line(path):
+            temporary.chmod(0o644)
+            temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -99,28 +178,55 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
-    """Yields a temporary directory beside ``path``; on success it replaces ``path``, on failure it is removed."""
-    ensure_writable_directory(path.parent)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    """Yields a temporary directory beside ``path``; on success it replaces ``path``, on failure it is removed.
+
+    Of several that write it at once, each succeeds, and the last one's stays.
+
+    Raises:
+        InvalidInputError: something that is no directory stands there.
+        AssetError: the place cannot be written, or is full.
+    """
+    target = place_to_write(path, directory=True)
+    ensure_writable_directory(target.parent)
+    with _one_line(path):
+        temporary = Path(tempfile.mkdtemp(dir=target.parent, prefix=_hidden(target)))
     try:
-        yield temporary
-        temporary.chmod(0o755)
-        if path.exists():
-            old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-old-"))
-            path.replace(old / path.name)
-            temporary.replace(path)
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            temporary.replace(path)
+        with _one_line(path, _NO_ROOM):
+            yield temporary
+        with _one_line(path):
+            temporary.chmod(0o755)
+            _replace_directory(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def _replace_directory(new: Path, target: Path) -> None:
+    """Puts ``new`` in the place of ``target``. No system does that in one step: what stands there is moved away first."""
+    old = Path(tempfile.mkdtemp(dir=target.parent, prefix=_hidden(target, "-old")))
+    try:
+        for attempt in range(_MOST_RIVALS):
+            moved = old / str(attempt)
+            with contextlib.suppress(FileNotFoundError):
+                target.replace(moved)
+            try:
+                new.replace(target)
+                return
+            except OSError as error:  # somebody else's directory has come in between, or the system refuses
+                if attempt == _MOST_RIVALS - 1 or error.errno not in _TAKEN:
+                    with contextlib.suppress(OSError):
+                        moved.replace(target)
+                    raise
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+
+
 def remove_directory(path: Path) -> None:
     """Removes a directory as a whole: it is moved out of sight first, so that nobody sees half of it."""
-    hidden = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-old-"))
-    path.replace(hidden / path.name)
-    shutil.rmtree(hidden, ignore_errors=True)
+    hidden = Path(tempfile.mkdtemp(dir=path.parent, prefix=_hidden(path, "-old")))
+    try:
+        path.replace(hidden / "removed")
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def write_json(path: Path, value: Any) -> None:

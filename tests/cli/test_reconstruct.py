@@ -70,6 +70,15 @@ def test_list_names_every_reconstructor(command):
     assert all(record["id"] in table and record["summary"] in table for record in records)
 
 
+def test_run_destroys_neither_its_input_nor_what_is_no_file(command, touches, tmp_path):
+    before = touches.read_bytes()
+    status, _, error = command("reconstruct", "run", "--touched", touches, "--output", touches)
+    assert status == 2 and "which is read; name another place" in error and touches.read_bytes() == before
+    os.mkfifo(tmp_path / "pipe.ply")
+    status, _, error = command("reconstruct", "run", "--touched", touches, "--output", tmp_path / "pipe.ply")
+    assert status == 2 and "pipe.ply: is a pipe, no file, and stays" in error and len(error.splitlines()) == 1
+
+
 @pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "off"])
 def test_run_writes_the_hull_as_a_mesh_in_metres(command, touches, tmp_path, suffix):
     output = tmp_path / "out" / f"hull.{suffix}"

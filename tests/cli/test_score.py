@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from tslam_bench.cli.score import object_table, score_main, summary_table
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.scoring.score_file import SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
-from tslam_bench.scoring.submission import SubmissionWriter
+from tslam_bench.scoring.submission import SubmissionWriter, read_submission
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +70,48 @@ def test_several_scores_go_to_a_folder(run: Path, tmp_path: Path) -> None:
     paths = [str(run / "submissions" / name) for name in ("random-grid", "mine-hull")]
     score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
     assert sorted(p.name for p in (tmp_path / "scores").iterdir()) == ["mine-hull.json", "random-grid.json"]
+
+
+def test_no_submission_and_no_other_file_is_written_over(run: Path, tmp_path: Path) -> None:
+    submission = tmp_path / "random-grid"
+    shutil.copytree(run / "submissions" / "random-grid", submission)
+    before = read_submission(submission).content_hash
+    (tmp_path / "notes.json").write_text('{"mine": 1}')
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "link").symlink_to(submission)
+    for output, reason in (
+        (submission / "submission.json", "would be written into .*random-grid, which is read"),
+        (submission / "score.json", "would be written into"),
+        (tmp_path / "link" / "score.json", "would be written into"),
+        (submission, "would be written into"),
+        (tmp_path / "notes.json", "notes.json: is no score file and stays"),
+        (tmp_path / "notes.txt", "is no score file and stays"),
+        (Path("/dev/null"), "is a device, no file, and stays"),
+    ):
+        with pytest.raises(InvalidInputError, match=reason):
+            score_main([str(submission), "--objects", "mug", "--output", str(output)])
+    assert read_submission(submission).content_hash == before
+    assert (tmp_path / "notes.json").read_text() == '{"mine": 1}' and (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_score_file_is_written_again_and_through_a_link(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "scores").mkdir()
+    (tmp_path / "score.json").symlink_to("scores/real.json")
+    for _ in range(2):
+        score_main([str(run / "submissions/random-grid"), "--objects", "mug", "--output", str(tmp_path / "score.json")])
+        assert (tmp_path / "score.json").is_symlink()
+        assert json.loads((tmp_path / "scores/real.json").read_text())["objects"] == ["mug"]
+
+
+def test_names_with_dots_do_not_meet(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a.v1", "a.v2"):
+        shutil.copytree(run / "submissions" / "random-grid", tmp_path / name)
+    score_main(
+        [*(str(tmp_path / name) for name in ("a.v1", "a.v2")), "--objects", "mug", "--output", str(tmp_path / "s")]
+    )
+    assert sorted(path.name for path in (tmp_path / "s").iterdir()) == ["a.v1.json", "a.v2.json"]
+    monkeypatch.chdir(tmp_path / "a.v1")
+    score_main([".", "--objects", "mug", "--output", str(tmp_path / "s")])
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import multiprocessing
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -20,7 +22,8 @@ import torch
 
 import tslam_bench
 from tslam_bench.constants import ENVIRONMENT_ID, HORIZON, NUM_JOINTS, TABLETOP_ID
-from tslam_bench.engine.hand_workers import WorkerError
+from tslam_bench.engine.hand_batch import BatchSettings
+from tslam_bench.engine.hand_workers import HandWorkers, WorkerError
 from tslam_bench.errors import InvalidInputError
 
 OBJECTS = ("mug", "hammer", "toruslarge")
@@ -261,6 +264,103 @@ def test_what_fails_in_the_caller_s_own_process_has_its_traceback_and_closes_the
     assert "hand_batch.py" in {Path(entry.path).name for entry in caught.traceback}
     with pytest.raises(WorkerError, match="closed"):
         envs.reset()
+
+
+@contextlib.contextmanager
+def alarm(seconds: float) -> Iterator[None]:
+    """Raises ``Interruption`` after so many seconds, wherever this process is then."""
+
+    def ring(*_: object) -> None:
+        raise Interruption
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("interrupted", ["reset", "step", "state"])
+def test_no_call_gets_the_answer_of_an_interrupted_one(interrupted):
+    """A worker is stopped while it should answer, the own time limit rings, then the worker goes on."""
+    workers = HandWorkers(2, BatchSettings("mug"), 2, timeout=60.0)
+    calls = {
+        "reset": lambda: workers.reset([3, 4], [0, 1]),
+        "step": lambda: workers.step(),
+        "state": lambda: workers.state(),
+    }
+    calls["reset"]()
+    processes = workers.processes
+    os.kill(processes[0].pid, signal.SIGSTOP)
+    with pytest.raises(Interruption), alarm(0.3):
+        calls[interrupted]()
+    for call in calls.values():
+        with pytest.raises(WorkerError, match="stopped; make a new environment"):
+            call()
+    assert not any(process.is_alive() for process in processes)
+    workers.stop()
+
+
+def test_an_answer_to_another_request_is_none():
+    workers = HandWorkers(2, BatchSettings("mug"), 2, timeout=60.0)
+    workers.reset([3, 4], [0, 1])
+    workers._workers[1][1].send((7, "state", None))  # as a second thread would
+    with pytest.raises(WorkerError, match="worker 1: its answer was to another request; use one thread only"):
+        workers.step()
+    assert workers.processes == []
+
+
+def test_an_interrupted_environment_says_what_broke_it():
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
+    envs.reset(seed=0)
+    os.kill(envs._hands.processes[0].pid, signal.SIGSTOP)
+    with pytest.raises(Interruption), alarm(0.3):
+        envs.step(np.zeros((2, NUM_JOINTS), np.float32))
+    with pytest.raises(WorkerError, match="is closed since step ended with Interruption; make a new one"):
+        envs.reset(seed=7)
+    envs.close()
+    envs.close()
+
+
+def test_workers_leave_ctrl_c_to_the_caller():
+    """A terminal and a notebook send Ctrl-C to every process; a program that finishes its step first may go on."""
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
+    envs.reset(seed=0)
+    for process in envs._hands.processes:
+        os.kill(process.pid, signal.SIGINT)
+    for _ in range(3):
+        envs.step(np.zeros((2, NUM_JOINTS), np.float32))
+    envs.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_forked_process_takes_nothing_from_its_parent():
+    """Data loaders fork: what the child asks or ends there must not reach the workers of the parent."""
+    code = """
+        import os, numpy as np, tslam_bench
+        if __name__ == "__main__":
+            envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=2)
+            first, _ = envs.reset(seed=7)
+            child = os.fork()
+            if child == 0:
+                try:
+                    envs.state()
+                except tslam_bench.errors.BenchmarkError as error:
+                    print(error, flush=True)
+                envs.close()
+                os._exit(0)
+            os.waitpid(child, 0)
+            again, _ = envs.reset(seed=7)
+            print(all(np.array_equal(first[name], again[name]) for name in first), envs.state()["object_name"])
+            envs.close()
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == [
+        "the vector environment belongs to the process that made it; make one in this process",
+        "True ['mug', 'mug']",
+    ], done.stderr
 
 
 def test_bad_actions_and_dead_workers():

@@ -18,7 +18,7 @@ from scored_run import NAMES, fake_score
 
 from tslam_bench.cli import main
 from tslam_bench.cli.score import score_main
-from tslam_bench.errors import AssetError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.leaderboard.commands import find_inputs, page_main
 from tslam_bench.leaderboard.page import build_page
 from tslam_bench.leaderboard.ranking import rank
@@ -239,6 +239,17 @@ def test_page_of_fake_scores_with_missing_figures() -> None:
 
 
 # --- The command -------------------------------------------------------------------------------------------------
+
+
+def test_a_page_destroys_no_submission_and_no_other_page(run: Path, tmp_path: Path) -> None:
+    submission = run / "submissions" / "random-grid"
+    before = sorted(path.name for path in submission.iterdir())
+    (tmp_path / "index.html").write_text("my home page")
+    for output, reason in ((submission, "is a submission"), (tmp_path, "is not a leaderboard's page and stays")):
+        with pytest.raises(InvalidInputError, match=reason):
+            page_main([str(run / "scores"), "--output", str(output)])
+    assert sorted(path.name for path in submission.iterdir()) == before
+    assert (tmp_path / "index.html").read_text() == "my home page"
 
 
 def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path: Path, monkeypatch) -> None:

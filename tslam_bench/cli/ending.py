@@ -17,12 +17,13 @@ _PACKAGE = str(Path(__file__).parents[1])
 
 @contextlib.contextmanager
 def one_line_errors(program: str) -> Iterator[None]:
-    """Exits with 2 (bad input: one line on standard error), 1 (the user's own code raised something: its traceback, then one
-    line), 130 (interrupted) or 141 (the reader of a pipe has gone).
+    """Exits with 2 (bad input, or the system refuses a file: one line on standard error), 1 (the user's own code raised
+    something: its traceback, then one line), 130 (interrupted) or 141 (the reader of a pipe has gone).
     """
     try:
         with named_extra():
             yield
+        sys.stdout.flush()  # here, where what goes wrong is one line
     except UserCodeError as error:
         _print_cause(error)
         print(f"{program}: {error}", file=sys.stderr)
@@ -34,8 +35,20 @@ def one_line_errors(program: str) -> Iterator[None]:
         print(f"{program}: interrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # a reader such as `head` that has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         sys.exit(141)
+    except OSError as error:
+        if error.filename is None:  # writing to standard output
+            _drop_output()
+        where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        print(f"{program}: {where}{error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _drop_output() -> None:
+    """What is still to be written to standard output goes nowhere: Python would try again, and fail again, at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _print_cause(error: UserCodeError) -> None:

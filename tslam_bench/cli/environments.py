@@ -152,11 +152,12 @@ def _video(command: Video) -> None:
     from PIL import Image
 
     from tslam_bench.engine.rendering import vulkan_device_available
-    from tslam_bench.files import atomic_file
+    from tslam_bench.files import atomic_file, check_output
 
     variant = get_variant(command.environment)
     if command.output.suffix not in (".webp", ".gif"):
         raise InvalidInputError(f"{command.output}: unknown kind of video; end the name in .webp or .gif")
+    check_output(command.output)
     if not vulkan_device_available():
         raise AssetError(
             "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU"

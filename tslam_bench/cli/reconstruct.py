@@ -15,7 +15,7 @@ from tslam_bench.cli.commands import run_command
 from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, WORKSPACE_EDGE
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_file
+from tslam_bench.files import atomic_file, check_output
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
@@ -138,6 +138,7 @@ def _run(parsed: Run) -> None:
         raise InvalidInputError(
             f"--output {parsed.output}: unknown kind of file; end it in .ply, .stl, .obj, .off or .npz"
         )
+    check_output(parsed.output, parsed.touched)
     if parsed.poses and len(parsed.poses) != len(parsed.touched):
         raise InvalidInputError(
             f"--poses: {len(parsed.poses)} poses for {len(parsed.touched)} files; give one for each"

@@ -16,9 +16,9 @@ from rich.table import Table
 
 from tslam_bench.cli.progress import Progress
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import write_json
+from tslam_bench.files import check_output, write_json
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
-from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
+from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore, is_score_file
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import Submission, read_submission
 from tslam_bench.scoring.verification import VerificationRecord
@@ -151,15 +151,29 @@ def _remark(result: ObjectScore) -> str:
 
 
 def _score_files(paths: Sequence[Path], output: Path | None) -> list[Path | None]:
-    """Where the score of each submission goes, or None; known before hours of scoring, not after."""
+    """Where the score of each submission goes, or None; known, and looked at, before hours of scoring, not after.
+
+    Raises:
+        InvalidInputError: two go to one file, or one would destroy something that is no score file.
+    """
     if output is None:
         return [None] * len(paths)
-    if len(paths) == 1:
-        return [output / f"{paths[0].stem}.json" if output.is_dir() else output]
-    names = [path.stem for path in paths]
-    if len(set(names)) != len(names):
-        raise InvalidInputError("score: two submissions have the same name; write them to different folders")
-    return [output / f"{name}.json" for name in names]
+    files = [output / f"{_name(path)}.json" for path in paths]
+    if len(paths) == 1 and not output.is_dir():
+        files = [output]
+    for file in files:
+        check_output(file, paths)
+        if file.exists() and not is_score_file(file):
+            raise InvalidInputError(f"{file}: is no score file and stays; name another file")
+        if files.count(file) > 1:
+            raise InvalidInputError(f"{file}: two submissions have the same name; score one after the other")
+    return [*files]
+
+
+def _name(submission: Path) -> str:
+    """A submission's name without the ending of an archive; that of a folder may hold dots."""
+    name = submission.name if submission.name not in ("", "..") else submission.resolve().name
+    return name[:-4] if name.lower().endswith(".zip") else name
 
 
 def check_workers(workers: int) -> None:

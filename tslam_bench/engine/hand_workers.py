@@ -1,4 +1,8 @@
-"""Hands in worker processes: K scenes each, arrays in shared memory, and workers that die or hang are found."""
+"""Hands in worker processes: K scenes each, arrays in shared memory, and workers that die or hang are found.
+
+Every request carries a number and every answer that of its request. Whatever comes between them, an exception of a signal
+handler as well as another thread's call, stops the workers: no later call gets an earlier one's answer.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import itertools
 import multiprocessing
 import os
 import selectors
+import signal
 import traceback
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -22,7 +27,7 @@ START_TIMEOUT: Final = 300.0
 
 
 class WorkerError(BenchmarkError, RuntimeError):
-    """A worker process died, hung, or raised something unforeseen."""
+    """A worker process died, hung, raised something unforeseen, or was interrupted."""
 
 
 class HandWorkers:
@@ -39,7 +44,8 @@ class HandWorkers:
 
     Raises:
         InvalidInputError, AssetError: what a worker's :class:`HandBatch` raises; this process may start no others.
-        WorkerError: a worker died or hung. Whatever is raised, all workers are then stopped.
+        WorkerError: a worker died or hung, or the workers were stopped before. Whatever is raised, by a call or in one, all
+            workers are then stopped.
     """
 
     def __init__(self, num_envs: int, settings: BatchSettings, processes: int | None, timeout: float) -> None:
@@ -48,6 +54,8 @@ class HandWorkers:
                 f"processes {processes!r}: this is a daemonic process, which may start no others; give processes=0"
             )
         self._timeout = timeout
+        self._owner = os.getpid()
+        self._number = 0  # of the last request
         count = min(processes or len(_available_cores()), num_envs)
         context = multiprocessing.get_context("spawn")
         # RawArrays are anonymous: nothing is left in the file system, even if the process is killed.
@@ -72,7 +80,7 @@ class HandWorkers:
                 self._workers.append((process, ours))
             self._collect(
                 START_TIMEOUT, "a script has to make it below 'if __name__ == \"__main__\":' or with processes=0"
-            )
+            )  # the answers to request 0
         except BaseException:
             self.stop()
             raise
@@ -90,7 +98,8 @@ class HandWorkers:
         poses: Sequence[int | None] | None = None,
     ) -> None:
         """Starts new episodes in ``envs``, in increasing order; see :meth:`HandBatch.reset`."""
-        for part, (_, pipe) in zip(self._slices, self._workers, strict=True):
+        requests: list[Any] = []
+        for part in self._slices:
             own = [position for position, env in enumerate(envs) if part.start <= env < part.stop]
             request = (
                 [seeds[position] for position in own],
@@ -98,20 +107,16 @@ class HandWorkers:
                 [objects[position] for position in own] if objects else None,
                 [poses[position] for position in own] if poses else None,
             )
-            self._send(pipe, ("reset", request if own else None))
-        self._collect(START_TIMEOUT)
+            requests.append(request if own else None)
+        self._ask("reset", requests, START_TIMEOUT)
 
     def step(self, repeat: int = 1) -> None:
         """``repeat`` control steps of all environments; see :meth:`HandBatch.step`."""
-        for _, pipe in self._workers:
-            self._send(pipe, ("step", repeat))
-        self._collect(self._timeout)
+        self._ask("step", [repeat] * len(self._slices), self._timeout)
 
     def state(self) -> dict[str, Any]:
         """Objects, poses and touched steps; see :meth:`HandBatch.state`."""
-        for _, pipe in self._workers:
-            self._send(pipe, ("state", None))
-        parts = self._collect(self._timeout)
+        parts = self._ask("state", [None] * len(self._slices), self._timeout)
         return {
             "object_name": [name for part in parts for name in part["object_name"]],
             "pose": [pose for part in parts for pose in part["pose"]],
@@ -119,18 +124,38 @@ class HandWorkers:
         }
 
     def stop(self) -> None:
-        """Stops the workers, kills those that do not; safe to call twice."""
-        for _, pipe in self._workers:
-            self._send(pipe, ("stop", None))
-            with contextlib.suppress(OSError):
-                pipe.close()
-        for process, _ in self._workers:
-            process.join(2)
-            if process.is_alive():
+        """Stops the workers, kills those that do not; safe to call twice, and in a forked process, which has none."""
+        workers, self._workers = self._workers, []
+        if os.getpid() != self._owner:
+            return  # they and their pipes are the parent's
+        try:
+            for _, pipe in workers:
+                self._send(pipe, (None, "stop", None))
+                with contextlib.suppress(OSError):
+                    pipe.close()
+            for process, _ in workers:
+                process.join(2)
+        finally:  # an impatient second Ctrl-C, too
+            for process, _ in workers:
                 process.kill()
-                process.join()
-        self._workers = []
-        self._selector.close()
+            self._selector.close()
+        for process, _ in workers:
+            process.join()
+
+    def _ask(self, name: str, arguments: Sequence[Any], timeout: float) -> list[Any]:
+        """One request to every worker, and their answers to it."""
+        if os.getpid() != self._owner:
+            raise WorkerError("the vector environment belongs to the process that made it; make one in this process")
+        if not self._workers:
+            raise WorkerError("the workers were stopped; make a new environment")
+        try:
+            self._number += 1
+            for (_, pipe), argument in zip(self._workers, arguments, strict=True):
+                self._send(pipe, (self._number, name, argument))
+            return self._collect(timeout)
+        except BaseException:  # what was asked for may still come: nobody may take it for the answer to something else
+            self.stop()
+            raise
 
     def _send(self, pipe: Any, message: Any) -> None:
         # A dead worker's pipe breaks; _collect says so with its exit code.
@@ -138,7 +163,8 @@ class HandWorkers:
             pipe.send(message)
 
     def _collect(self, timeout: float, remedy: str = "make a new environment") -> list[Any]:
-        """One answer from every worker, in order; stops all of them and raises if any fails."""
+        """The answer of every worker to the last request, in order; stops all of them and raises if any fails."""
+        number = self._number
         answers: dict[int, Any] = {}
         left = timeout
         while len(answers) < len(self._workers):
@@ -153,7 +179,7 @@ class HandWorkers:
             for key, _ in ready:
                 process, pipe = self._workers[key.data]
                 try:
-                    kind, answer = pipe.recv()
+                    answered, kind, answer = pipe.recv()
                 except (EOFError, ConnectionResetError):  # a worker that dies closes its end of the pipe
                     process.join(5)
                     self.stop()
@@ -163,6 +189,9 @@ class HandWorkers:
                 if kind == "error":
                     self.stop()
                     raise answer
+                if answered != number:
+                    self.stop()
+                    raise WorkerError(f"worker {key.data}: its answer was to another request; use one thread only")
                 answers[key.data] = answer
         return [answers[index] for index in range(len(self._workers))]
 
@@ -207,12 +236,14 @@ def _work(
     """A worker: builds its scenes, then answers requests until the parent stops it or goes away."""
     _settle(core)
     parent.close()  # or the pipe would not break when the parent dies
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; what it means is the parent's to say
+    number: int | None = 0
     try:
         arrays = {name: view[part] for name, view in _views(raw, num_envs).items()}
         batch = HandBatch(part.stop - part.start, settings, arrays)
-        pipe.send(("ready", None))
+        pipe.send((number, "ready", None))
         while True:
-            request, argument = pipe.recv()
+            number, request, argument = pipe.recv()
             if request == "stop":
                 return
             answer = None
@@ -222,12 +253,12 @@ def _work(
                 answer = batch.state()
             elif argument is not None:
                 batch.reset(*argument)
-            pipe.send(("done", answer))
+            pipe.send((number, "done", answer))
     except (EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
         return
     except (InvalidInputError, AssetError) as error:
-        pipe.send(("error", error))
+        pipe.send((number, "error", error))
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         message = f"worker raised {type(error).__name__}: {error} ({where.name}, line {where.lineno})"
-        pipe.send(("error", WorkerError(message.replace("\n", " "))))
+        pipe.send((number, "error", WorkerError(message.replace("\n", " "))))

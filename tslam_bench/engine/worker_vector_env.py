@@ -54,6 +54,7 @@ class TactileVectorEnv(VectorEnv):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
     _hands: HandBatch | HandWorkers | None = None
+    _broken: str = "is closed"
 
     def __init__(
         self,
@@ -149,14 +150,15 @@ class TactileVectorEnv(VectorEnv):
 
     def _open(self) -> HandBatch | HandWorkers:
         if self._hands is None:
-            raise WorkerError("the vector environment is closed; make a new one")
+            raise WorkerError(f"the vector environment {self._broken}; make a new one")
         return self._hands
 
     def _ask(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """``call``; what fails or is interrupted leaves some hands a step ahead of others, so it closes the environment."""
         try:
             return call(*arguments)
-        except BaseException:
+        except BaseException as error:
+            self._broken = f"is closed since {call.__name__} ended with {type(error).__name__}"
             self.close_extras()
             raise
 

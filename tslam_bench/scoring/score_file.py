@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -120,3 +121,12 @@ class SubmissionScore:
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise InvalidInputError(f"{where}: not a score file ({error}); score the submission again") from error
+
+
+def is_score_file(path: Path) -> bool:
+    """Whether a file is, or was meant as, a score file of any version."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and "score_version" in value

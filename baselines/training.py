@@ -24,6 +24,7 @@ from gymnasium.vector import VectorEnv
 from torch.utils.tensorboard import SummaryWriter
 
 from tslam_bench.constants import ENVIRONMENT_ID
+from tslam_bench.engine.gpu_physics import simulation_device
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
@@ -142,7 +143,7 @@ def make_training_environments(config: TrainingConfig) -> VectorEnv:
 
 def learning_device(config: TrainingConfig) -> str:
     """``cpu`` or ``cuda``: where ``make_vec`` simulates, there the network learns."""
-    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
+    return simulation_device(config.device, ENVIRONMENT_ID)
 
 
 def machine_description() -> dict[str, Any]:

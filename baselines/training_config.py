@@ -69,7 +69,7 @@ class TrainingConfig:
     checkpoint_every: int = 64_000
     """Control steps between checkpoints; rounded up to whole iterations."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate and learn; auto: on a CUDA GPU where there is one (not run on a GPU yet)."""
+    """Where to simulate and learn; auto: on a CUDA GPU where gpu-check has passed (not run on a GPU yet)."""
     processes: int | None = None
     """Worker processes that simulate on the CPU; default: the cores. Results do not depend on it."""
     torch_threads: int = 2

@@ -31,8 +31,8 @@ class NativeOutput:
 
 
 @contextmanager
-def captured_output() -> Iterator[NativeOutput]:
-    """Keeps what is written to standard output and error, by C++ too; it is passed on at the end."""
+def captured_output(echo: bool = True) -> Iterator[NativeOutput]:
+    """Keeps what is written to standard output and error, by C++ too; with ``echo`` it is passed on at the end."""
     output = NativeOutput()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -51,5 +51,5 @@ def captured_output() -> Iterator[NativeOutput]:
                 os.close(descriptor)
             file.seek(0)
             output.text = file.read().decode(errors="replace")
-            if output.text:
+            if output.text and echo:
                 sys.stderr.write(output.text)

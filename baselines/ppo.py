@@ -146,17 +146,26 @@ class PPO:
         self.optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
         self.scale = ReturnScale()
         self.steps = 0
+        self._scene_seed: int | None = None
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.episodes: list[dict[str, float]] = []
         self._generator = torch.Generator()
         self._parts = config.torch_threads if self.device.type == "cpu" else 1
         self._pool = ThreadPoolExecutor(self._parts, initializer=torch.set_num_threads, initargs=(1,))
 
-    def begin(self, seed: int) -> None:
-        """Resets environments and random numbers: what follows depends on ``seed`` and :meth:`state` alone."""
+    def begin(self, seed: int, scene_seed: int | None = None) -> None:
+        """Resets environments and random numbers: what follows depends on the seeds and :meth:`state` alone.
+
+        A GPU scene draws other objects, by ``scene_seed``, when that is another one than last time; the CPU draws them in
+        every episode.
+        """
         self._generator.manual_seed(seed)
-        # A GPU scene draws other objects when it is reconfigured; the CPU does so at every episode.
-        self._observation, _ = self.environments.reset(seed=seed % 2**31, options={"reconfigure": True})
+        scene_seed = seed if scene_seed is None else scene_seed
+        if scene_seed not in (self._scene_seed, seed):
+            self.environments.reset(seed=scene_seed % 2**31, options={"reconfigure": True})
+        rebuild = scene_seed == seed != self._scene_seed
+        self._observation, _ = self.environments.reset(seed=seed % 2**31, options={"reconfigure": rebuild})
+        self._scene_seed = scene_seed
         self._sums = torch.zeros(self.environments.num_envs, 1 + len(COUNTS))
         self._discounted = torch.zeros(self.environments.num_envs, device=self.device)
         self._noise = torch.randn(self.environments.num_envs, NUM_JOINTS, generator=self._generator)

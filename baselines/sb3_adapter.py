@@ -6,7 +6,7 @@ episode returns as arrays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -56,7 +56,7 @@ class TactileVecEnv(VecEnv):
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = next((o for o in self._options if o), None)
         observation, info = self.environments.reset(seed=seeds, options=options)
-        self.reset_infos = [_info_of(info, i) for i in range(self.num_envs)]
+        self.reset_infos = _infos_of(info, range(self.num_envs))
         self._reset_seeds()
         self._reset_options()
         return observation_to_numpy(observation)
@@ -77,10 +77,13 @@ class TactileVecEnv(VecEnv):
             {"TimeLimit.truncated": bool(t and not e)} for t, e in zip(truncated, terminated, strict=True)
         ]
         if done.any():
-            for i in np.flatnonzero(done).tolist():
-                infos[i].update(_info_of(info["final_info"], i))
-                infos[i]["terminal_observation"] = observation_to_numpy(info["final_obs"][i])
-                self.reset_infos[i] = _info_of(info, i)
+            ended = np.flatnonzero(done).tolist()
+            terminal = _terminal_observations([info["final_obs"][i] for i in ended])
+            others = _infos_of(info["final_info"], ended), terminal, _infos_of(info, ended)
+            for i, own, last, begun in zip(ended, *others, strict=True):
+                infos[i].update(own)
+                infos[i]["terminal_observation"] = last
+                self.reset_infos[i] = begun
         return observation_to_numpy(observation), to_numpy(reward).astype(np.float32), done, infos
 
     def close(self) -> None:
@@ -122,12 +125,26 @@ def _byte_or_float_space(space: spaces.Space) -> spaces.Dict:
     return spaces.Dict(converted)
 
 
-def _info_of(info: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Environment ``index``'s share of a batched info: numbers (n,) as Python numbers."""
-    own: dict[str, Any] = {}
-    for key, value in info.items():
-        if key.startswith("_"):
-            continue
-        if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 1 and value.dtype != object:
-            own[key] = value[index].item()
-    return own
+def _infos_of(info: Mapping[str, Any], envs: Sequence[int]) -> list[dict[str, Any]]:
+    """Each of these environments' share of a batched info: numbers (n,) as Python numbers, brought to the host as a whole."""
+    columns = {
+        key: to_numpy(value).tolist()
+        for key, value in info.items()
+        if not key.startswith("_")
+        and isinstance(value, torch.Tensor | np.ndarray)
+        and value.ndim == 1
+        and value.dtype != object
+    }
+    return [{key: column[env] for key, column in columns.items()} for env in envs]
+
+
+def _terminal_observations(last: Sequence[Mapping[str, Any]]) -> list[Observation]:
+    """Observations of single environments as numpy copies, brought to the host as a whole."""
+    entries = {key: [one[key] for one in last] for key in last[0]}
+    batch = observation_to_numpy(
+        {
+            key: torch.stack(values) if isinstance(values[0], torch.Tensor) else np.stack(values)
+            for key, values in entries.items()
+        }
+    )
+    return [{key: value[row] for key, value in batch.items()} for row in range(len(last))]

@@ -24,6 +24,7 @@ from gymnasium.vector import VectorEnv
 from torch.utils.tensorboard import SummaryWriter
 
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
+from tslam_bench.engine.gpu_physics import simulation_device
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
@@ -155,7 +156,7 @@ def make_training_environments(config: TrainingConfig) -> VectorEnv:
 
 def learning_device(config: TrainingConfig) -> str:
     """``cpu`` or ``cuda``: where ``make_vec`` simulates, there the network learns."""
-    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
+    return simulation_device(config.device, ENVIRONMENT_ID)
 
 
 def machine_description() -> dict[str, Any]:
@@ -218,7 +219,10 @@ class _Log:
 def _learn_chunk(learner: PPO, config: TrainingConfig, log: _Log, on_progress: Report | None) -> None:
     """The steps up to the next checkpoint, as a function of the learner's state alone."""
     end = min(learner.steps + config.chunk_steps, config.total_steps)
-    learner.begin(int(np.random.SeedSequence([config.seed, learner.steps]).generate_state(1)[0]))
+    last_scene = learner.steps // config.scene_steps * config.scene_steps
+    learner.begin(
+        *(int(np.random.SeedSequence([config.seed, at]).generate_state(1)[0]) for at in (learner.steps, last_scene))
+    )
     report = None if on_progress is None else lambda done: on_progress(done, log.figures)
     while learner.steps < end:
         log.add(learner.iterate(report), config.iteration_steps)
@@ -265,7 +269,7 @@ def _plain(config: TrainingConfig) -> dict[str, Any]:
 
 def _check_same_settings(config: TrainingConfig, found: dict[str, Any], output: Path) -> None:
     here = _plain(config)
-    compared = (here.keys() | found.keys()) - {"processes"}  # bits do not depend on it
+    compared = (here.keys() | found.keys()) - {"processes", "reconfigure_every"}  # bits do not depend on them, on a CPU
     different = sorted(key for key in compared if here.get(key) != found.get(key))
     if different:
         pairs = ", ".join(f"{key} {found.get(key)!r} there, {here.get(key)!r} here" for key in different)

@@ -86,8 +86,10 @@ class TrainingConfig:
     """Gradients with a larger norm are scaled down to it."""
     checkpoint_every: int = 64_000
     """Control steps between checkpoints; rounded up to whole iterations."""
+    reconfigure_every: int = 20
+    """Iterations between new objects for a GPU scene, which is built anew for them; the CPU draws one per episode."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate and learn; auto: on a CUDA GPU where there is one (not run on a GPU yet)."""
+    """Where to simulate and learn; auto: on a CUDA GPU where gpu-check has passed (not run on a GPU yet)."""
     processes: int | None = None
     """Worker processes that simulate on the CPU; default: the cores; 0: none but the trainer. Results do not depend on it."""
     torch_threads: int = 2
@@ -100,7 +102,7 @@ class TrainingConfig:
             raise InvalidInputError(f"baseline {self.baseline!r}: is {spec.kind}, there is nothing to train")
         for name in (
             *("steps", "num_envs", "rollout_steps", "action_repeat", "batch_size", "epochs"),
-            *("checkpoint_every", "torch_threads"),
+            *("checkpoint_every", "reconfigure_every", "torch_threads"),
         ):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} {getattr(self, name)}: must be at least 1")
@@ -158,3 +160,8 @@ class TrainingConfig:
     def chunk_steps(self) -> int:
         """``checkpoint_every`` rounded up to whole iterations."""
         return -(-self.checkpoint_every // self.iteration_steps) * self.iteration_steps
+
+    @property
+    def scene_steps(self) -> int:
+        """Control steps between new scenes on a GPU."""
+        return self.reconfigure_every * self.iteration_steps

@@ -8,24 +8,22 @@ from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import numpy as np
-import sapien
 import torch
 from gymnasium import spaces
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register
-from mani_skill.utils.structs import Actor
-from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, GPUMemoryConfig, SceneConfig, SimConfig
 
 from tslam_bench.constants import CONTROL_STEP_SECONDS, HORIZON
-from tslam_bench.engine import physics, requests
+from tslam_bench.engine import gpu_physics, physics, requests
 from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
 from tslam_bench.engine.gpu_memory import gpu_memory
 from tslam_bench.engine.hand_agent import AdroitHand
 from tslam_bench.engine.hand_scene import HandScene
 from tslam_bench.engine.rendering import vulkan_device_available
 from tslam_bench.engine.rewards import Rewards
+from tslam_bench.engine.scene_objects import SceneObjects, register_actor
 from tslam_bench.engine.sensing import Contacts
 from tslam_bench.engine.sensing_numba import CompiledSensing
 from tslam_bench.engine.sensing_torch import TorchSensing
@@ -40,6 +38,8 @@ from tslam_bench.variants import FREE, Variant
 
 MAX_GPU_ENVIRONMENTS: Final = 1 << 16
 """More sub-scenes than this on one GPU are probably a mistake."""
+SPACING: Final = 2.5
+"""Metres between the sub-scenes of a GPU: float32 is the coarser the further out one lies (docs/gpu.md)."""
 
 
 class TactileSLAMEnv(WholeState):
@@ -100,6 +100,8 @@ class TactileSLAMEnv(WholeState):
     SUPPORTED_REWARD_MODES = requests.ENVIRONMENT_REWARD_MODES
     VARIANT: ClassVar[Variant] = FREE
     agent: AdroitHand
+    _contacts: Contacts | None
+    _objects: SceneObjects
 
     def __init__(
         self,
@@ -120,16 +122,21 @@ class TactileSLAMEnv(WholeState):
         requests.check_reward_mode(reward_mode)
         requests.check_control_mode(control_mode)
         backend = kwargs.get("sim_backend", "auto")
-        self._wants_gpu = "cuda" in str(backend) or (isinstance(num_envs, int) and num_envs > 1)
-        if self._wants_gpu and not torch.cuda.is_available():
+        on_gpu = str(backend).partition(":")[0] in ("cuda", "gpu", "physx_cuda")
+        self._wants_gpu = on_gpu or (isinstance(num_envs, int) and num_envs > 1)
+        if self._wants_gpu and not gpu_physics.cuda_available():
             raise InvalidInputError(
                 f"num_envs {num_envs}, sim_backend {backend!r}: batched simulation needs a GPU and there is none (CUDA); "
                 "make environments with num_envs=1 instead"
             )
         self._asked_num_envs = requests.check_whole("num_envs", num_envs, 1, MAX_GPU_ENVIRONMENTS)
+        if self._wants_gpu:
+            gpu_physics.enable_gpu_physics()
         self._starts = StartSampler(object, objects, split, pose, self.VARIANT)
         self.object_name: list[str] = [""] * num_envs
         self.pose: list[int] = [0] * num_envs
+        self.faults: Any = 0
+        """(E,) int64 on a GPU: control steps since this was made with an action or a hand that was not finite."""
         if render_backend == "auto":
             wants_images = render_mode is not None or obs_mode not in ("state_dict", "state", "none")
             render_backend = "gpu" if wants_images and vulkan_device_available() else "none"
@@ -155,7 +162,8 @@ class TactileSLAMEnv(WholeState):
             # Whole numbers with the right ratio; the true time step is set in _setup_scene.
             sim_freq=physics.PROTOCOL.substeps * round(1 / CONTROL_STEP_SECONDS),
             control_freq=round(1 / CONTROL_STEP_SECONDS),
-            scene_config=SceneConfig(**physics.scene_settings()),
+            spacing=SPACING,
+            scene_config=SceneConfig(**physics.scene_settings(on_gpu=self._wants_gpu)),
             default_materials_config=DefaultMaterialsConfig(*physics.MATERIAL),
             gpu_memory_config=memory,
         )
@@ -169,11 +177,6 @@ class TactileSLAMEnv(WholeState):
     def control_timestep(self) -> float:
         """Control timestep (s)."""
         return CONTROL_STEP_SECONDS
-
-    @property
-    def uses_tensors(self) -> bool:
-        """Whether sensing, rewards and observations are computed with torch on the device, not with numpy on the host."""
-        return self.gpu_sim_enabled
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -195,60 +198,54 @@ class TactileSLAMEnv(WholeState):
 
     def _load_scene(self, options: dict) -> None:
         skin = build_skin(load_hand().shapes)
-        backend = TorchBackend(self.device) if self.uses_tensors else NumpyBackend()
+        backend = TorchBackend(self.device) if self.gpu_sim_enabled else NumpyBackend()
         self._sensing: Any = (
             TorchSensing(self.num_envs, skin, self.device)
-            if self.uses_tensors
+            if self.gpu_sim_enabled
             else CompiledSensing(self.num_envs, skin)
         )
         self._rewards = Rewards(self._reward_mode, self.num_envs, backend)
+        if self.gpu_sim_enabled and isinstance(self.faults, int):
+            self.faults = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         render = self.scene.can_render()
         if self.gpu_sim_enabled:
-            self._load_gpu_objects(options, render)  # GPU only
+            prepared = [self._draw_object(env, options) for env in range(self.num_envs)]
+            self._objects = SceneObjects(self.scene, prepared, self.VARIANT.table, render)
+            self.object_name = [one.name for one in prepared]
         else:
             table = physics.table_entity(can_render=render) if self.VARIANT.table else None
             bodies = physics.BodyPool(can_render=render)
             self.hand = HandScene(self.scene.sub_scenes[0], self.agent.robot._objs[0], bodies, table)
 
-    def _load_gpu_objects(self, options: dict, render: bool) -> None:
-        """One body per sub-scene, fixed until the next reconfigure: a GPU scene cannot gain bodies."""  # GPU only
-        entities = []
-        for env, scene in enumerate(self.scene.sub_scenes):
-            prepared = self._draw_object(env, options)
-            entity = physics.object_entity(prepared, f"scene-{env}_object", render)
-            entity.pose = sapien.Pose([0, 0, 0], physics.pose_quaternion(0))
-            scene.add_entity(entity)
-            self.object_name[env] = prepared.name
-            entities.append(entity)
-            if self.VARIANT.table:
-                table = physics.table_entity(f"scene-{env}_table", render)
-                table.pose = physics.table_pose(prepared)
-                scene.add_entity(table)
-        self._register_object(entities)
-
-    def _register_object(self, entities: list[sapien.Entity]) -> None:
-        scene_idxs = torch.arange(self.num_envs, dtype=torch.int, device=self.device)
-        actor = Actor.create_from_entities(entities, self.scene, scene_idxs, shared_name="object")
-        actor.initial_pose = Pose.create(entities[0].pose, device=self.device)
-        self.scene.actors["object"] = actor
-        self.object_actor = actor
+    def _clear(self) -> None:
+        """Lets go of all that holds the scene, so that the old one is gone before a new one is made."""
+        for name in ("hand", "_objects", "_sensing", "_rewards", "_contacts", "_reward"):
+            setattr(self, name, None)
+        self.__dict__.pop("segmentation_id_map", None)  # ManiSkill's cache holds actors, and they the scene
+        super()._clear()
 
     # -- reset --------------------------------------------------------------------------------
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict]:
         """Starts an episode; see the class docstring for ``options``."""
         request = requests.check_reset(seed, options, self.num_envs, self._starts)
-        options = {**(options or {}), "object": request.objects, "pose": request.poses}
-        for env, name in enumerate(request.objects or ()):
-            wanted = self.object_name[env] if name is None else self._starts.load(name).name
-            if self.gpu_sim_enabled and not options.get("reconfigure") and wanted != self.object_name[env]:  # GPU only
-                raise InvalidInputError(
-                    f"options['object']: a GPU scene keeps its objects ({self.object_name[env]!r} in environment {env}); "
-                    "add options['reconfigure'] = True"
-                )
-        if seed is not None:
+        envs, reconfigure = np.flatnonzero(request.mask), bool((options or {}).get("reconfigure"))
+        if not reconfigure and self.gpu_sim_enabled:
+            for env, name in enumerate(request.objects or ()):
+                if name is not None and self._starts.canonical(name) != self.object_name[env]:
+                    raise InvalidInputError(
+                        f"options['object']: a GPU scene keeps its objects ({self.object_name[env]!r} in environment {env}); "
+                        "add options['reconfigure'] = True"
+                    )
+        if reconfigure and len(envs) < self.num_envs:
+            raise InvalidInputError("options['reconfigure']: rebuilds all environments; leave env_idx out")
+        if request.seeds[0] is not None:
             gym.Env.reset(self, seed=request.seeds[0])  # np_random, for wrappers: nothing here draws from it
-            seed = request.seeds
-        return super().reset(seed=seed, options=options)
+        if len(envs) == 0:
+            info = self.get_info() | {"reconfigure": False}
+            return self.get_obs(info), info
+        options = {**(options or {}), "object": request.objects, "pose": request.poses}
+        options["env_idx"] = torch.as_tensor(envs, device=self.device)
+        return super().reset(seed=self._seeds(request, envs, reconfigure), options=options)
 
     def _draw_object(self, env: int, options: Mapping[str, Any]) -> Any:
         names = options.get("object")
@@ -257,13 +254,15 @@ class TactileSLAMEnv(WholeState):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         starts, poses = [], options.get("pose")
         for env in env_idx.tolist():
-            prepared = self._draw_object(env, options)
-            if self.gpu_sim_enabled:  # bodies are fixed until the next reconfigure
-                prepared = self._starts.load(self.object_name[env])  # GPU only
             rng, pose = self._batched_episode_rng[env], poses[env] if poses else None
+            if self.gpu_sim_enabled:  # bodies are fixed until the next reconfigure
+                self._starts.skip_object(rng)
+                prepared = self._objects.prepared[env]
+            else:
+                prepared = self._draw_object(env, options)
             starts.append(self._starts.draw(rng, pose=pose, prepared=prepared))
         self._begin(env_idx, starts)
-        if not self.uses_tensors and bool(self._sensing.touches(self.hand.skin_matrices()).any()):
+        if not self.gpu_sim_enabled and bool(self._sensing.touches(self.hand.skin_matrices()).any()):
             name = self.object_name[0]
             raise AssetError(f"{name}: touches the hand at the start, so it does not fit in the workspace")
 
@@ -275,24 +274,21 @@ class TactileSLAMEnv(WholeState):
             self._sensing.set_object(env, start.prepared.name, start.prepared.field, start.pose)
             self._rewards.set_object(env, start.prepared, start.pose)
         if self.gpu_sim_enabled:
-            self._place_on_gpu(env_idx, starts)  # GPU only
+            self._place_on_gpu(env_idx, starts)
         else:
             self._start, self._past_targets = starts[0], []
             self.hand.begin(starts[0])
             self.scene.sub_scenes[0], self.scene.px = self.hand.scene, self.hand.system
-            self._register_object([self.hand.object_body])
+            register_actor(self.scene, "object", [self.hand.object_body])
         self._sensing.begin(envs)
         self._rewards.begin(envs)
-        self._contacts: Contacts | None = None
+        self._contacts = None
         self._reward = None
 
     def _place_on_gpu(self, env_idx: torch.Tensor, starts: Sequence[Start]) -> None:
-        """Turns the objects and places the hands of ``env_idx``."""  # GPU only
+        """Places objects and hands of ``env_idx``, which is in ascending order: ManiSkill's setters go by a mask."""
+        self._objects.place(starts)
         order = np.argsort(self.agent.joint_order)  # from JOINT_NAMES to the simulator's order
-        quaternions = np.stack([physics.pose_quaternion(start.pose) for start in starts])
-        position = torch.zeros((len(env_idx), 3), device=self.device)
-        rotation = torch.tensor(quaternions, dtype=torch.float32, device=self.device)
-        self.object_actor.set_pose(Pose.create_from_pq(position, rotation))
         self.agent.robot.set_qpos(
             torch.tensor(np.stack([start.qpos for start in starts])[:, order], device=self.device)
         )
@@ -314,17 +310,20 @@ class TactileSLAMEnv(WholeState):
     def _checked(self, action: Any) -> torch.Tensor:
         if not self.gpu_sim_enabled:
             return torch.from_numpy(requests.check_actions(action, self.num_envs))
-        # Looking for NaN on the GPU would stall it every step; the drive targets are clipped there all the same.
-        value = torch.as_tensor(action, dtype=torch.float32, device=self.device)  # GPU only
-        return value.reshape(requests.check_action_shape(tuple(value.shape), self.num_envs))  # GPU only
+        # Raising would wait for the device in every step: what is not finite is replaced there and counted in ``faults``.
+        value = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        value = value.reshape(requests.check_action_shape(tuple(value.shape), self.num_envs))
+        self.faults += ~torch.isfinite(value).all(1)
+        return torch.where(torch.isfinite(value), value, 0.0)
 
     def _step_action(self, action: Any) -> Any:
         action = super()._step_action(action)
         step = self._elapsed_steps  # counted up after the action
         if not self.gpu_sim_enabled:
             self._past_targets.append(self.agent.controller.targets)
-        if self.uses_tensors:
+        if self.gpu_sim_enabled:
             self._contacts = self._sensing.step(self.agent.device_skin_matrices(), step)
+            self.faults += self._sensing.lost
         else:
             self._contacts = self._sensing.step(self.hand.skin_matrices(), step.numpy())
         self._reward = self._rewards.step(self._contacts)
@@ -349,16 +348,17 @@ class TactileSLAMEnv(WholeState):
         return {**self._get_obs_agent(), **self._get_obs_extra(info)}
 
     def _get_obs_agent(self) -> dict[str, torch.Tensor]:
-        if self.uses_tensors:
-            order = self.agent.device_joint_order
-            return {"qpos": self.agent.robot.get_qpos()[:, order], "qvel": self.agent.robot.get_qvel()[:, order]}
+        if self.gpu_sim_enabled:
+            order, robot = self.agent.device_joint_order, self.agent.robot
+            joints = {"qpos": robot.get_qpos()[:, order], "qvel": robot.get_qvel()[:, order]}
+            return {name: torch.where(torch.isfinite(value), value, 0.0) for name, value in joints.items()}
         return {"qpos": torch.from_numpy(self.hand.qpos[None]), "qvel": torch.from_numpy(self.hand.qvel[None])}
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         occupancy = self._sensing.occupancy
         return {
             "touch": torch.as_tensor(self._sensing.link_touch()),
-            "occupancy": occupancy if self.uses_tensors else torch.from_numpy(occupancy.copy()),
+            "occupancy": occupancy if self.gpu_sim_enabled else torch.from_numpy(occupancy.copy()),
             "time": (self._elapsed_steps.to(torch.float32) / HORIZON).clamp(max=1.0)[:, None],
         }
 

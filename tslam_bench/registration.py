@@ -10,7 +10,7 @@ import gymnasium
 import gymnasium.vector
 
 from tslam_bench.constants import ENVIRONMENT_ID
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.engine import gpu_physics
 from tslam_bench.extras import named_extra
 from tslam_bench.variants import ENVIRONMENT_IDS, get_variant
 
@@ -58,7 +58,7 @@ def make_vec(
     Args:
         environment_id: a registered id.
         num_envs: environments.
-        device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
+        device: ``cpu``, ``cuda`` or ``auto``: CUDA where ``tslam-bench gpu-check`` has passed, else the CPU.
         object: one object for every episode.
         objects: names to draw from, one draw per episode; neither means the whole split.
         split: ``test``, ``train``, ``val`` or a private split; None: named objects are found in whatever split has them, and
@@ -77,9 +77,7 @@ def make_vec(
         MissingPackageError: the extra ``sim`` is not installed.
     """
     get_variant(environment_id)
-    if device not in ("auto", "cpu", "cuda"):
-        raise InvalidInputError(f"device {device!r}: unknown; choose auto, cpu or cuda")
-    if device != "cpu" and _cuda_available():
+    if gpu_physics.simulation_device(device, environment_id) == "cuda":
         return _make_cuda_vec(
             environment_id,
             num_envs,
@@ -93,8 +91,6 @@ def make_vec(
             },
             action_repeat,
         )
-    if device == "cuda":
-        raise InvalidInputError("device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto")
     from tslam_bench.engine.hand_batch import BatchSettings
     from tslam_bench.engine.worker_vector_env import TactileVectorEnv
 
@@ -103,18 +99,12 @@ def make_vec(
     return TactileVectorEnv(num_envs, settings, processes, timeout, action_repeat)
 
 
-def _cuda_available() -> bool:
-    import torch
-
-    return torch.cuda.is_available()
-
-
 def _make_cuda_vec(
     environment_id: str, num_envs: int, kwargs: dict[str, Any], action_repeat: int
 ) -> gymnasium.vector.VectorEnv:
     from tslam_bench.engine.maniskill_vector_env import BatchedVectorEnv
 
-    environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)  # GPU only
+    environment = gymnasium.make(environment_id, num_envs=num_envs, sim_backend="physx_cuda", **kwargs)
     return BatchedVectorEnv(environment, action_repeat)
 
 

@@ -267,6 +267,25 @@ def test_state_carries_all_that_a_chunk_depends_on() -> None:
         assert torch.equal(a, b)
 
 
+class Recorded(Bandit):
+    """Keeps what was asked of ``reset``."""
+
+    def reset(self, *, seed=None, options=None):
+        self.calls = [*getattr(self, "calls", []), (seed, options["reconfigure"])]
+        return super().reset(seed=seed, options=options)
+
+
+def test_a_gpu_scene_is_built_anew_when_its_seed_changes_and_after_a_resumption() -> None:
+    def calls(*begun: tuple[int, int]) -> list[tuple[int, bool]]:
+        learner = PPO(CONFIG, Recorded(16, True), make_network("fast", 0.4, seed=0), "cpu")
+        for seeds in begun:
+            learner.begin(*seeds)
+        return learner.environments.calls  # type: ignore[attr-defined]
+
+    assert calls((10, 10), (11, 10), (12, 12)) == [(10, True), (11, False), (12, True)]
+    assert calls((11, 10), (12, 12)) == [(10, True), (11, False), (12, True)], "killed after the first chunk"
+
+
 def test_threads_share_minibatches_out_and_change_nothing_but_rounding() -> None:
     (one, first), (two, second), (again, third) = (
         train(replace(CONFIG, torch_threads=threads), True, 3) for threads in (1, 2, 2)

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 import tslam_bench
 from tslam_bench.baselines.sb3_adapter import TactileVecEnv
@@ -37,6 +38,35 @@ def test_terminal_observation_is_the_last_one_and_a_copy() -> None:
             act(vec)
         assert terminal["qpos"][1] == 2 and (terminal["occupancy"] == 0).all()
         assert observation["qpos"][:, 1].tolist() == [0, 2]  # the learner stores an observation after the next step
+
+
+def test_tensors_come_to_the_host_as_a_whole() -> None:
+    """Number by number, each of them would make the host wait for a GPU."""
+
+    class NoSingleNumbers(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            assert "_local_scalar_dense" not in str(func)
+            return func(*args, **(kwargs or {}))
+
+    class Own(Counter):
+        """What the environment itself does is none of the adapter's business."""
+
+        def reset(self, **asked):
+            with _disable_current_modes():
+                return super().reset(**asked)
+
+        def step(self, actions):
+            with _disable_current_modes():
+                return super().step(actions)
+
+    vec = TactileVecEnv(Own((2, 2, 3), tensors=True))
+    with NoSingleNumbers():
+        vec.reset()
+        act(vec)
+        _, _, dones, infos = act(vec)
+    assert dones.tolist() == [True, True, False]
+    assert [info.get("elapsed") for info in infos] == [2, 2, None]
+    assert all(isinstance(info["elapsed"], int) for info in infos[:2])
 
 
 def test_episodes_go_on_where_others_end() -> None:

@@ -23,11 +23,11 @@ RADIUS, OFFSET = 0.05, np.array([0.02, -0.01, 0.015])
 
 
 def sphere_field(radius: float = RADIUS, spacing: float = 1.5e-3, centre: np.ndarray = OFFSET) -> SignedDistanceField:
-    """Exact signed distance to a sphere off the object's origin, so that a wrong turn shows."""
+    """Signed distance to a sphere off the object's origin, so that a wrong turn shows; float16 as prepared fields are."""
     reach = radius + 0.02
     axis = np.arange(-reach, reach + spacing, spacing)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    values = (np.linalg.norm(grid, axis=-1) - radius).astype(np.float32)
+    values = (np.linalg.norm(grid, axis=-1) - radius).astype(np.float16).astype(np.float32)
     return SignedDistanceField(centre + axis[0], spacing, values, 0.0)
 
 

@@ -19,7 +19,8 @@ from tslam_bench.cli.progress import Progress
 from tslam_bench.constants import DEFAULT_SPLIT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, write_json
-from tslam_bench.objects import splits, store
+from tslam_bench.objects import packs, splits, store
+from tslam_bench.objects.packs import PACK_LIMIT
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,28 @@ class Verify:
     """Split (default: all that are prepared)."""
 
 
+@dataclass(frozen=True)
+class Pack:
+    """Put prepared objects and the hand into few compact files, for a machine that cannot prepare them."""
+
+    split: str = "test"
+    """Split."""
+    objects: tuple[str, ...] = ()
+    """Names of objects (default: all that are prepared)."""
+    output: Path = Path("packs")
+    """Folder to write to."""
+    limit: float = PACK_LIMIT / 1e6
+    """Largest file (MB)."""
+
+
+@dataclass(frozen=True)
+class Unpack:
+    """Put what packs hold into the cache; hashes are checked, and what is there already stays."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Files that 'pack' wrote."""
+
+
 def main(arguments: Sequence[str]) -> None:
     """Runs ``tslam-bench assets`` with the given arguments. Raises BenchmarkError for bad input."""
     commands = {
@@ -119,6 +142,8 @@ def main(arguments: Sequence[str]) -> None:
         "list": (List, _list),
         "show": (Show, _show),
         "verify": (Verify, _verify),
+        "pack": (Pack, _pack),
+        "unpack": (Unpack, _unpack),
     }
     run_command(
         "tslam-bench assets", "The benchmark's objects and its hand, and meshes of your own.", commands, arguments
@@ -330,3 +355,19 @@ def _verify(command: Verify) -> None:
     if lines:
         raise AssetError(f"{len(lines)} files are missing or corrupt; run the prepare command again to rebuild them")
     print(f"{count} objects are intact")
+
+
+def _pack(command: Pack) -> None:
+    split = splits.check_split(command.split)
+    names = sorted({splits.resolve_name(name, split) for name in command.objects}) or splits.prepared_names(split)
+    if not names:
+        raise AssetError(f"split {split}: no object is prepared; run: tslam-bench assets prepare --split {split}")
+    print(f"{packs.pack_hand(command.output)}: the hand")
+    for path, count in packs.pack_objects(names, split, command.output, int(command.limit * 1e6)):
+        print(f"{path}: {count} objects, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _unpack(command: Unpack) -> None:
+    for path in command.files:
+        written, there = packs.unpack(path)
+        print(f"{path}: {written} written, {there} there already")

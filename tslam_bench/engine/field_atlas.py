@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ class Fields:
     """The signed-distance field of every environment, on the backend's device.
 
     Attributes:
-        values: (n,) float32, all fields one after the other (m).
+        values: (n,) float32 or float16, all fields one after the other (m).
         offset: (E,) int64, where an environment's field begins in ``values``.
         stride: (E, 3) int64, of its axes.
         last_cell: (E, 3) float32, index of its last cell.
@@ -46,89 +47,99 @@ class FieldAtlas:
     Args:
         num_envs: environments.
         backend: numpy or torch.
+        dtype: of the array. Prepared fields are stored as float16, which therefore holds the same values as float32.
     """
 
     SPARE_SLOTS = 16
 
-    def __init__(self, num_envs: int, backend: Backend) -> None:
+    def __init__(self, num_envs: int, backend: Backend, dtype: Any = np.float32) -> None:
         self._backend = backend
+        self._dtype = dtype
         self._limit = num_envs + self.SPARE_SLOTS
-        self._names: list[str | None] = []  # of the slots
-        self._fields: list[SignedDistanceField | None] = []
+        self._slots: dict[str, int] = {}
+        self._fields: list[SignedDistanceField] = []  # of the slots
         self._last_use: list[int] = []
         self._slot_size = 0
         self._clock = 0
         self._values: Array = None
-        self._objects: list[tuple[str, SignedDistanceField] | None] = [None] * num_envs
+        self._names: list[str | None] = [None] * num_envs  # of the environments
+        self._waiting: dict[str, SignedDistanceField] = {}  # set, not bound yet
+        # What environments have, on the host; a row changes when its environment gets another object.
+        self._sizes = np.ones((num_envs, 3), dtype=np.int64)
+        self._spacings = np.ones(num_envs)
+        self._origins = np.zeros((num_envs, 3))
         self._turn = np.tile(np.eye(3, dtype=np.float32), (num_envs, 1, 1))
         self._bound: Fields | None = None
 
     def set_object(self, env: int, name: str, field: SignedDistanceField, pose: int) -> None:
         """Puts an object in a pose into one environment."""
-        self._objects[env] = (name, field)
+        if self._names[env] != name:
+            self._names[env] = name
+            self._sizes[env], self._spacings[env], self._origins[env] = field.values.shape, field.spacing, field.origin
+        if name not in self._slots:
+            self._waiting[name] = field
         self._turn[env] = grids.pose_rotation(pose)
         self._bound = None
 
     def bound(self) -> Fields:
-        """The fields of all environments as arrays."""
+        """The fields of all environments as arrays. Let go of those of an earlier call first: they hold its memory."""
         if self._bound is None:
             self._bound = self._bind()
         return self._bound
 
     def _bind(self) -> Fields:
-        objects = [entry for entry in self._objects if entry is not None]
-        if len(objects) < len(self._objects):
+        if None in self._names:
             raise ValueError("set_object has to be called for every environment before begin")
-        in_use = {name for name, _ in objects}
-        for name, field in objects:
-            self._place(name, field, in_use)
-        offsets = [self._names.index(name) * self._slot_size for name, _ in objects]  # read last: placing moves slots
-        sizes = np.array([field.values.shape for _, field in objects], dtype=np.int64)
-        spacings = np.array([float(field.spacing) for _, field in objects])
-        origins = np.array([field.origin for _, field in objects], dtype=np.float64)
+        names = [name for name in self._names if name is not None]
+        self._place(dict.fromkeys(names))
+        slots = np.array([self._slots[name] for name in names], dtype=np.int64)
+        sizes, array = self._sizes, self._backend.array
         strides = np.stack([sizes[:, 1] * sizes[:, 2], sizes[:, 2], np.ones_like(sizes[:, 2])], axis=1)
-        array = self._backend.array
         return Fields(
             self._values,
-            array(np.array(offsets, dtype=np.int64)),
+            array(slots * self._slot_size),
             array(strides),
             array((sizes - 2).astype(np.float32)),
-            array(origins.astype(np.float32)),
-            array((1.0 / spacings).astype(np.float32)),
-            array((np.sqrt(3.0) / 2 * 1.001 * spacings).astype(np.float32)),  # half a cell diagonal
+            array(self._origins.astype(np.float32)),
+            array((1.0 / self._spacings).astype(np.float32)),
+            array((np.sqrt(3.0) / 2 * 1.001 * self._spacings).astype(np.float32)),  # half a cell diagonal
             array(self._turn),
         )
 
-    def _place(self, name: str, field: SignedDistanceField, in_use: Collection[str]) -> None:
-        """Copies the field called ``name`` in if it is not there; the fields named by ``in_use`` stay."""
+    def _place(self, in_use: Mapping[str, None]) -> None:
+        """Copies in what is not there yet; the fields named by ``in_use`` stay."""
         self._clock += 1
-        if name not in self._names:
-            self._put(self._free_slot(in_use), name, field)
-        self._last_use[self._names.index(name)] = self._clock
-
-    def _free_slot(self, in_use: Collection[str]) -> int:
-        if len(self._names) < self._limit:
-            self._names.append(None)
-            self._fields.append(None)
-            self._last_use.append(0)
-            return len(self._names) - 1
-        idle = [slot for slot, name in enumerate(self._names) if name not in in_use]
-        return min(idle, key=lambda slot: self._last_use[slot])
-
-    def _put(self, slot: int, name: str, field: SignedDistanceField) -> None:
-        self._names[slot], self._fields[slot] = name, field
-        needed = len(self._names)
-        if self._values is None or field.values.size > self._slot_size or needed * self._slot_size > len(self._values):
-            self._slot_size = max(self._slot_size, field.values.size)
+        fresh = [name for name in in_use if name not in self._slots]
+        changed = [self._take_slot(name, in_use) for name in fresh]
+        self._waiting.clear()
+        for name in in_use:
+            self._last_use[self._slots[name]] = self._clock
+        size = max((self._fields[slot].values.size for slot in changed), default=0)
+        needed = len(self._fields)
+        if self._values is None or size > self._slot_size or needed * self._slot_size > len(self._values):
+            self._slot_size = max(self._slot_size, size)
+            self._values = None  # frees the old array before the new one is made
             slots = min(self._limit, max(4, 2 * needed))
-            self._values = self._backend.full((slots * self._slot_size,), 0, np.float32)
-            for other, kept in enumerate(self._fields):
-                if kept is not None:
-                    self._copy(other, kept)
+            self._values = self._backend.full((slots * self._slot_size,), 0, self._dtype)
+            changed = list(range(needed))
+        for slot in changed:
+            self._copy(slot, self._fields[slot])
+
+    def _take_slot(self, name: str, in_use: Mapping[str, None]) -> int:
+        field = self._waiting[name]
+        if len(self._fields) < self._limit:
+            slot = len(self._fields)
+            self._fields.append(field)
+            self._last_use.append(0)
         else:
-            self._copy(slot, field)
+            idle = [other for other in self._slots if other not in in_use]
+            oldest = min(idle, key=lambda other: self._last_use[self._slots[other]])
+            slot = self._slots.pop(oldest)
+            self._fields[slot] = field
+        self._slots[name] = slot
+        return slot
 
     def _copy(self, slot: int, field: SignedDistanceField) -> None:
         start = slot * self._slot_size
-        flat = np.ascontiguousarray(field.values, dtype=np.float32).reshape(-1)
+        flat = np.ascontiguousarray(field.values, dtype=self._dtype).reshape(-1)
         self._values[start : start + len(flat)] = self._backend.array(flat)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class HandController(BaseController):
     def set_action(self, action: torch.Tensor) -> None:
         """Sets the drive targets for actions (E, 28) in [-1, 1]."""
         if self._on_gpu:
-            self._set_device_targets(self._targets(action.to(torch.float32), self.qpos))  # GPU only
+            self._set_device_targets(self._targets(action.to(torch.float32), _finite(self.qpos)))
             return
         qpos = self.articulation._objs[0].qpos[self._order]
         self._set_host_targets(self._targets(action.numpy().astype(np.float32, copy=False), qpos[None])[0])
@@ -55,13 +56,13 @@ class HandController(BaseController):
 
     def _set_device_targets(self, targets: torch.Tensor) -> None:
         """Writes (E, 28) targets of all hands. ManiSkill's setter masks the rows, which waits for the device each step."""
-        rows, columns = self.articulation.get_joint_target_indices(self.joints)  # GPU only
-        self.articulation.px.cuda_articulation_target_qpos.torch()[rows, columns] = targets  # GPU only
+        rows, columns = self.articulation.get_joint_target_indices(self.joints)
+        self.articulation.px.cuda_articulation_target_qpos.torch()[rows, columns] = targets
 
     def hold(self) -> None:
         """Makes the current joint positions the targets (start of an episode)."""
         if self._on_gpu:
-            self._set_device_targets(self.qpos)  # GPU only
+            self._set_device_targets(_finite(self.qpos))
             return
         self._set_host_targets(self.articulation._objs[0].qpos[self._order])
 
@@ -113,8 +114,17 @@ class AdroitHand(BaseAgent):
 
     def device_skin_matrices(self) -> torch.Tensor:
         """(E, L, 3, 4) float32 poses of the skin links in each sub-scene, GPU simulation."""
-        poses = torch.stack([link.pose.raw_pose for link in self.skin_links], dim=1)
-        return matrices_from_poses(poses)
+        return matrices_from_poses(self.robot.px.cuda_rigid_body_data.torch()[self._skin_rows, :7])
+
+    @cached_property
+    def _skin_rows(self) -> torch.Tensor:
+        """(E, L) rows of the skin links in PhysX's body data; known once the scene is set up."""
+        return torch.stack([link._body_data_index for link in self.skin_links], dim=1)
+
+
+def _finite(value: torch.Tensor) -> torch.Tensor:
+    """``value`` with zeros where a simulation that broke left something else: PhysX must not be handed NaN."""
+    return torch.where(torch.isfinite(value), value, 0.0)
 
 
 def matrices_from_poses(poses: torch.Tensor) -> torch.Tensor:

@@ -15,10 +15,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tslam_bench.constants import HORIZON
-from tslam_bench.engine.requests import check_action_repeat, check_mask, check_seeds
+from tslam_bench.engine.requests import check_action_repeat, check_mask
 from tslam_bench.engine.same_step import info_at_the_end, with_masks
 from tslam_bench.engine.worker_vector_env import INFO
-from tslam_bench.errors import InvalidInputError
 
 _SUMMED = ("new_touched", "new_visited")
 
@@ -62,18 +61,13 @@ class BatchedVectorEnv(VectorEnv):
         Args:
             seed: of environment 0, counting up, or one per environment; None lets the generators go on.
             options: ``object`` and ``pose``, one value or one per environment; ``reset_mask``, (num_envs,) bool, which
-                environments to reset (unseeded); ``reconfigure``, whether a GPU scene is rebuilt with other objects.
+                environments to reset; ``reconfigure``, whether a GPU scene is rebuilt with other objects.
         """
-        seeds = check_seeds(seed, self.num_envs)
-        if any(value is None for value in seeds) and not all(value is None for value in seeds):
-            raise InvalidInputError("seed: None among numbers; ManiSkill seeds every environment or none")
         given = dict(options or {})
         mask = check_mask(given, self.num_envs)
-        if given.pop("reset_mask", None) is not None:
-            if seeds[0] is not None:
-                raise InvalidInputError("options['reset_mask']: a partial reset takes no seed; leave one of them out")
-            given["env_idx"] = torch.as_tensor(np.flatnonzero(mask), device=self.device)
-        observation, info = self.environment.reset(seed=None if seeds[0] is None else seeds, options=given)
+        given["env_idx"] = np.flatnonzero(mask)
+        given.pop("reset_mask", None)
+        observation, info = self.environment.reset(seed=seed, options=given)
         self._steps[mask] = 0
         return observation, with_masks(_counts(info), torch.tensor(mask, device=self.device))
 
@@ -104,6 +98,11 @@ class BatchedVectorEnv(VectorEnv):
         observation, _ = self.environment.reset(options={} if ended.all() else {"env_idx": envs})
         self._steps[ended] = 0
         return observation, total, terminated, truncated, info
+
+    @property
+    def faults(self) -> torch.Tensor:
+        """(num_envs,) int64 control steps so far with an action or a hand that was not finite; see the task."""
+        return self.environment.unwrapped.faults
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the task."""

@@ -1,4 +1,4 @@
-"""What native libraries print: PhysX reports overflowing GPU buffers to the log and goes on with contacts missing."""
+"""What native libraries print: PhysX reports overflowing GPU buffers and worse to the log alone, and goes on."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-OVERFLOW: Final = re.compile(r"overflow|PxGpuDynamicsMemoryConfig|increase (the )?(capacity|its|to)", re.IGNORECASE)
-"""PhysX's complaints: 'Contact buffer overflow detected, please increase its size to at least ...' and the like."""
+COMPLAINT: Final = re.compile(
+    r"overflow|PxGpuDynamicsMemoryConfig|increase (the )?(capacity|its|to)|fail(ed)? to launch|error (code )?700\b|illegal memory"
+    r"|mem free failed|out of memory|oblong",
+    re.IGNORECASE,
+)
+"""What PhysX, SAPIEN and CUDA print when results can no longer be trusted: 'Contact buffer overflow detected, please increase its
+size to at least ...', kernels that did not launch, memory errors, hulls whose contacts a GPU misses."""
 
 
 class NativeOutput:
@@ -20,14 +25,14 @@ class NativeOutput:
     def __init__(self) -> None:
         self.text = ""
 
-    def overflows(self) -> list[str]:
-        """Lines in which PhysX says that a GPU buffer was too small."""
-        return [line.strip() for line in self.text.splitlines() if OVERFLOW.search(line)]
+    def complaints(self) -> list[str]:
+        """Lines that say that the simulation cannot be trusted."""
+        return [line.strip() for line in self.text.splitlines() if COMPLAINT.search(line)]
 
 
 @contextmanager
-def captured_output() -> Iterator[NativeOutput]:
-    """Keeps what is written to standard output and error, by C++ too; it is passed on at the end."""
+def captured_output(echo: bool = True) -> Iterator[NativeOutput]:
+    """Keeps what is written to standard output and error, by C++ too; with ``echo`` it is passed on at the end."""
     output = NativeOutput()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -46,5 +51,5 @@ def captured_output() -> Iterator[NativeOutput]:
                 os.close(descriptor)
             file.seek(0)
             output.text = file.read().decode(errors="replace")
-            if output.text:
+            if output.text and echo:
                 sys.stderr.write(output.text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -35,6 +36,8 @@ MATERIAL: Final = (STATIC_FRICTION, DYNAMIC_FRICTION, RESTITUTION)
 COOKING_SCALE: Final = 100.0
 """Hulls are cooked in centimetres and scaled back: PhysX's plane tolerance is 0.7 mm and eats small hulls cooked in metres."""
 
+GPU_SCENE_WORKERS: Final = 8
+"""Most threads that a GPU scene uses on the host."""
 CACHED_BODIES: Final = 64
 """Cooked objects kept per process: cooking one takes up to a few dozen milliseconds."""
 _ARM_TRANSLATIONS: Final = slice(0, 3)
@@ -94,12 +97,16 @@ PROTOCOL: Final = PhysicsSettings()
 """The protocol's settings."""
 
 
-def scene_settings(settings: PhysicsSettings = PROTOCOL) -> dict[str, Any]:
-    """The settings of scenes, bodies and shapes, by the names of ManiSkill's ``SceneConfig``."""
+def scene_settings(settings: PhysicsSettings = PROTOCOL, on_gpu: bool = False) -> dict[str, Any]:
+    """The settings of scenes, bodies and shapes, by the names of ManiSkill's ``SceneConfig``.
+
+    On a GPU hands never sleep (nothing would wake one whose targets are written into a buffer), and threads share PhysX's
+    filtering of pairs out, which stays on the host.
+    """
     return {
         "gravity": np.array(GRAVITY),
         "bounce_threshold": BOUNCE_THRESHOLD,
-        "sleep_threshold": SLEEP_THRESHOLD,
+        "sleep_threshold": 0.0 if on_gpu else SLEEP_THRESHOLD,
         "contact_offset": settings.contact_offset,
         "rest_offset": REST_OFFSET,
         "solver_position_iterations": settings.position_iterations,
@@ -109,7 +116,7 @@ def scene_settings(settings: PhysicsSettings = PROTOCOL) -> dict[str, Any]:
         "enable_ccd": False,
         "enable_enhanced_determinism": False,
         "enable_friction_every_iteration": True,
-        "cpu_workers": 0,
+        "cpu_workers": min(GPU_SCENE_WORKERS, os.cpu_count() or 1) if on_gpu else 0,
     }
 
 
@@ -155,13 +162,13 @@ def pose_quaternion(pose: int) -> np.ndarray:
     return np.array([0.0, w, z, 0.0])  # yaw * (0, 1, 0, 0)
 
 
-def collision_shapes(prepared: PreparedObject) -> list[physx.PhysxCollisionShapeConvexMesh]:
-    """Cooks an object's hulls.
+def collision_shapes(prepared: PreparedObject, material: Any = None) -> list[physx.PhysxCollisionShapeConvexMesh]:
+    """Cooks an object's hulls, of ``material`` or one made for them.
 
     Raises:
         AssetError: PhysX cannot cook a hull.
     """
-    material = physx.PhysxMaterial(*MATERIAL)
+    material = material or physx.PhysxMaterial(*MATERIAL)
     shapes = []
     for index, (vertices, _) in enumerate(prepared.hulls):
         try:
@@ -179,7 +186,9 @@ def collision_shapes(prepared: PreparedObject) -> list[physx.PhysxCollisionShape
     return shapes
 
 
-def object_entity(prepared: PreparedObject, name: str = "object", can_render: bool = False) -> sapien.Entity:
+def object_entity(
+    prepared: PreparedObject, name: str = "object", can_render: bool = False, material: Any = None
+) -> sapien.Entity:
     """A fixed body with the object's hulls, and its true mesh as its looks where rendering is possible.
 
     Raises:
@@ -189,7 +198,7 @@ def object_entity(prepared: PreparedObject, name: str = "object", can_render: bo
     entity.name = name
     body = physx.PhysxRigidDynamicComponent()
     body.kinematic = True  # fixed, but not static: a GPU scene turns it between episodes
-    for shape in collision_shapes(prepared):
+    for shape in collision_shapes(prepared, material):
         body.attach(shape)
     if len(body.collision_shapes) != len(prepared.hulls):
         raise AssetError(f"{prepared.name}: {len(body.collision_shapes)} of {len(prepared.hulls)} hulls reached PhysX")
@@ -199,15 +208,14 @@ def object_entity(prepared: PreparedObject, name: str = "object", can_render: bo
     return entity
 
 
-def table_entity(name: str = "table", can_render: bool = False) -> sapien.Entity:
+def table_entity(name: str = "table", can_render: bool = False, material: Any = None) -> sapien.Entity:
     """The tabletop variant's table: a fixed box."""
     entity = sapien.Entity()
     entity.name = name
     body = physx.PhysxRigidDynamicComponent()
     body.kinematic = True  # as the object: its height changes with the object between episodes
     half = np.array(TABLE_SIZE, dtype=np.float32) / 2
-    material = physx.PhysxMaterial(*MATERIAL)
-    body.attach(physx.PhysxCollisionShapeBox(half, material))
+    body.attach(physx.PhysxCollisionShapeBox(half, material or physx.PhysxMaterial(*MATERIAL)))
     if can_render:
         looks = sapien.render.RenderBodyComponent()
         wood = sapien.render.RenderMaterial(base_color=[0.55, 0.47, 0.38, 1.0], roughness=0.8, specular=0.1)

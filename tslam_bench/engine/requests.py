@@ -21,6 +21,9 @@ ENVIRONMENT_REWARD_MODES = (*REWARD_MODES, "none")
 """Reward modes of an environment; with ``none`` every reward is 0."""
 
 
+_LARGEST_SEED = 2**32 - 1  # of numpy's RandomState
+
+
 class Objects(Protocol):
     """What a reset asks about objects and poses; a ``StartSampler``."""
 
@@ -63,13 +66,13 @@ class ResetRequest:
     Attributes:
         seeds: (E,) one per environment; None lets a generator go on.
         objects: (E,) names, None where one is drawn; None draws all.
-        poses: (E,) poses; None draws all.
+        poses: (E,) poses, None where one is drawn; None draws all.
         mask: (E,) bool, environments to reset.
     """
 
     seeds: list[int | None]
     objects: list[str | None] | None
-    poses: list[int] | None
+    poses: list[int | None] | None
     mask: NDArray[np.bool_]
 
 
@@ -78,7 +81,8 @@ def check_reset(seed: Any, options: Mapping[str, Any] | None, num_envs: int, kno
 
     Args:
         seed: of environment 0, counting up, or one per environment, or None.
-        options: ``object`` and ``pose``, one value or one per environment; ``reset_mask``, (E,) bool. Others are not looked at.
+        options: ``object`` and ``pose``, one value or one per environment; ``reset_mask``, (E,) bool, or ``env_idx``, numbers of
+            environments in any order. None is as good as leaving an entry out. Others are not looked at.
         num_envs: E.
         known: which objects and poses there are.
     """
@@ -88,21 +92,38 @@ def check_reset(seed: Any, options: Mapping[str, Any] | None, num_envs: int, kno
     for name in objects or ():
         if name is not None:
             known.check_name(name)
-    checked = None if poses is None else [known.variant.check_pose(pose) for pose in poses]
+    checked = None
+    if poses is not None:
+        checked = [None if pose is None else known.variant.check_pose(pose) for pose in poses]
     return ResetRequest(check_seeds(seed, num_envs), objects, checked, check_mask(options, num_envs))
 
 
 def check_seeds(seed: Any, num_envs: int) -> list[int | None]:
     """One seed per environment: environment ``i`` of a single seed ``s`` has ``s + i``."""
-    if seed is None or isinstance(seed, (int, np.integer)):
-        return [None if seed is None else int(seed) + env for env in range(num_envs)]
-    return [None if value is None else int(value) for value in _one_each("seed", list(seed), num_envs)]
+    seed = _plain(seed)
+    if isinstance(seed, list):
+        return [
+            None if value is None else check_whole("seed", value, 0, _LARGEST_SEED) for value in _each(seed, num_envs)
+        ]
+    if seed is None:
+        return [None] * num_envs
+    first = check_whole("seed", seed, 0, _LARGEST_SEED + 1 - num_envs)
+    return [first + env for env in range(num_envs)]
 
 
 def check_mask(options: Mapping[str, Any], num_envs: int) -> NDArray[np.bool_]:
-    """(E,) bool, which environments ``options`` ask to reset; all without ``reset_mask``."""
-    mask = np.asarray(options.get("reset_mask", np.ones(num_envs, dtype=bool)))
-    if mask.shape != (num_envs,) or mask.dtype != bool:
+    """(E,) bool, which environments ``options`` ask to reset; all without ``reset_mask`` and ``env_idx``."""
+    asked, numbers = options.get("reset_mask"), options.get("env_idx")
+    if asked is not None and numbers is not None:
+        raise InvalidInputError("options['reset_mask'], options['env_idx']: give one of them")
+    if numbers is not None:
+        mask = np.zeros(num_envs, dtype=bool)
+        numbers = _plain(numbers)
+        for env in numbers if isinstance(numbers, list) else [numbers]:
+            mask[check_whole("options['env_idx']", env, 0, num_envs - 1)] = True
+        return mask
+    mask = np.ones(num_envs, dtype=bool) if asked is None else np.asarray(_plain(asked))
+    if mask.shape != (num_envs,) or (mask.dtype != bool and mask.size):
         raise InvalidInputError(f"options['reset_mask']: shape {mask.shape} {mask.dtype}; give ({num_envs},) bool")
     return mask
 
@@ -143,15 +164,21 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def _one_each(name: str, values: list, num_envs: int) -> list:
+def _each(values: list, num_envs: int, name: str = "seed") -> list:
     if len(values) != num_envs:
         raise InvalidInputError(f"{name}: {len(values)} values for {num_envs} environments; give one each")
     return values
 
 
+def _plain(value: Any) -> Any:
+    """Sequences, arrays and tensors on any device as a list; all else as it is."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple, range)) else value
+
+
 def _option(options: Mapping[str, Any], name: str, num_envs: int) -> list | None:
-    if name not in options:
+    value = _plain(options.get(name))
+    if value is None:
         return None
-    value = options[name]
-    values = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value] * num_envs
-    return _one_each(f"options[{name!r}]", values, num_envs)
+    return _each(value, num_envs, f"options[{name!r}]") if isinstance(value, list) else [value] * num_envs

@@ -11,7 +11,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from tslam_bench.constants import GRID_SIZE
 from tslam_bench.engine.arrays import Array, Backend
@@ -52,12 +54,13 @@ class Sensing(ABC):
         num_envs: E.
         skin: probes and volume points.
         backend: where the arrays live.
+        field_dtype: of the signed-distance fields in memory.
     """
 
-    def __init__(self, num_envs: int, skin: Skin, backend: Backend) -> None:
+    def __init__(self, num_envs: int, skin: Skin, backend: Backend, field_dtype: Any = np.float32) -> None:
         self.num_envs = num_envs
         self.backend = backend
-        self.atlas = FieldAtlas(num_envs, backend)
+        self.atlas = FieldAtlas(num_envs, backend, field_dtype)
         self._on: Array = backend.full((num_envs, len(skin.probes)), False, bool)
 
     @property

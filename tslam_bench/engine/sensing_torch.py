@@ -7,7 +7,7 @@ batched. ``sensing_numba`` does the same sums in the same order.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from tslam_bench.engine.field_atlas import Fields
 from tslam_bench.engine.sensing import MAX_NEW_CONTACTS, VOXELS, Contacts, Sensing
 from tslam_bench.engine.skin import PointSet, Skin
 
+FARTHEST: Final = 100.0
+"""No entry of a link's matrix (m) is larger while the simulation is sound."""
 _GRID = (GRID_SIZE, GRID_SIZE, GRID_SIZE)
 
 
@@ -33,7 +35,8 @@ class TorchSensing(Sensing):
 
     def __init__(self, num_envs: int, skin: Skin, device: Any) -> None:
         backend = TorchBackend(device)
-        super().__init__(num_envs, skin, backend)
+        super().__init__(num_envs, skin, backend, np.float16)
+        self._fields: Fields | None = None
         self._probes = _PlacedPoints(skin.probes, backend)
         self._volume = _PlacedPoints(skin.volume, backend)
         self._reach = backend.array(skin.probes.radius + np.float32(TOUCH_DISTANCE))
@@ -47,6 +50,11 @@ class TorchSensing(Sensing):
         self._touched_count = backend.full((num_envs,), 0, np.int64)
         self._visited_count = backend.full((num_envs,), 0, np.int64)
         self._first_voxel = backend.array(np.arange(num_envs, dtype=np.int64)[:, None] * VOXELS)
+        self.lost = backend.full((num_envs,), False, bool)
+        """(E,) bool, hands whose last pose was not finite or absurdly far away: they felt nothing."""
+        nowhere = np.eye(3, 4, dtype=np.float32)
+        nowhere[:, 3] = FARTHEST
+        self._nowhere = backend.array(nowhere)
         self._slots = backend.array(np.arange(MAX_NEW_CONTACTS))
 
     def _rows(self, grid: torch.Tensor) -> torch.Tensor:
@@ -67,7 +75,8 @@ class TorchSensing(Sensing):
 
     @override
     def begin(self, envs: Sequence[int]) -> None:
-        self._fields: Fields = self.atlas.bound()
+        self._fields = None  # the atlas may need its memory
+        self._fields = self.atlas.bound()
         chosen = list(envs)
         self._on[chosen] = False
         for grid, value in ((self._touched, False), (self._visited, False), (self._touched_step, -1)):
@@ -90,6 +99,9 @@ class TorchSensing(Sensing):
 
     @override
     def step(self, link_matrices: torch.Tensor, step: torch.Tensor) -> Contacts:
+        # One NaN would become an index out of range, which ends a CUDA context with all environments in it.
+        self.lost = ~(link_matrices.abs() < FARTHEST).flatten(1).all(1)
+        link_matrices = torch.where(self.lost[:, None, None, None], self._nowhere, link_matrices)
         on, world = self._touch(link_matrices)
         new = on & ~self._on
         self._on = on
@@ -107,6 +119,7 @@ class TorchSensing(Sensing):
     def _touch(self, link_matrices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(E, P) probes that are on, and (3, E, P) the nearest point of the surface to each, in the world."""
         fields = self._fields
+        assert fields is not None, "begin comes before step"
         # Into the object's frame: exact, since a turn is a signed permutation and the other products are zero.
         turned = (fields.turn[:, None, :, :, None] * link_matrices[:, :, :, None, :]).sum(2)
         placed = self._probes.place(_components(turned))
@@ -178,7 +191,7 @@ def _interpolate(fields: Fields, placed: torch.Tensor) -> tuple[torch.Tensor, to
     index = fields.offset[:, None] + cell[0] + cell[1] + cell[2]
     along_x, along_y = fields.stride[:, 0, None], fields.stride[:, 1, None]
     c = {
-        (i, j, k): fields.values[index + i * along_x + j * along_y + k]  # the stride of z is 1
+        (i, j, k): fields.values[index + i * along_x + j * along_y + k].to(torch.float32)  # the stride of z is 1
         for i in (0, 1)
         for j in (0, 1)
         for k in (0, 1)

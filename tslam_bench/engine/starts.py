@@ -94,6 +94,10 @@ class StartSampler:
         """Raises InvalidInputError for an object that is unknown in the split (None: in every split)."""
         self._key(name)
 
+    def canonical(self, name: str) -> str:
+        """The name without alias of an object that :meth:`check_name` accepts; nothing is loaded."""
+        return self._key(name)[0]
+
     def _key(self, name: str) -> tuple[str, str]:
         """Name without alias, and split; looked up once, as it reads the cache's folders."""
         if name not in self._keys:
@@ -105,6 +109,10 @@ class StartSampler:
         """Draws an object; ``name`` overrides the draw, which is made all the same so that the rest does not depend on it."""
         draw = rng.uniform()
         return self.load(self.names[int(draw * len(self.names))] if name is None else name)
+
+    def skip_object(self, rng: np.random.RandomState) -> None:
+        """Takes from the generator what :meth:`draw_object` takes, where the object is there already."""
+        rng.uniform()
 
     def draw(
         self,

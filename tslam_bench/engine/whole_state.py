@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.engine.hand_scene import HandScene
+from tslam_bench.engine.requests import ResetRequest
 from tslam_bench.engine.rewards import Rewards
 from tslam_bench.engine.sensing import Sensing
 from tslam_bench.engine.starts import Start, StartSampler
@@ -43,6 +44,18 @@ class WholeState(BaseEnv):
 
     def _begin(self, env_idx: torch.Tensor, starts: Sequence[Start]) -> None:
         raise NotImplementedError
+
+    def _seeds(self, request: ResetRequest, envs: NDArray[np.int64], reconfigure: bool) -> list[int] | None:
+        """What to hand to ManiSkill, which seeds all generators or none; a part of them is seeded here."""
+        given = {env: request.seeds[env] for env in envs.tolist() if request.seeds[env] is not None}
+        if not given or len(given) == self.num_envs:
+            return list(given.values()) or None
+        main = self._batched_main_rng.rngs
+        if reconfigure:
+            return [int(given[env] if env in given else main[env].randint(2**31)) for env in range(self.num_envs)]
+        for env, seed in given.items():
+            main[env], self._batched_episode_rng.rngs[env] = (np.random.RandomState(seed) for _ in range(2))
+        return None
 
     def get_state_dict(self) -> dict[str, Any]:
         """The whole state, a nested dict of tensors (E, ...): copies. See the class docstring."""
@@ -82,9 +95,13 @@ class WholeState(BaseEnv):
             return
         env_idx = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
         envs, episode = env_idx.tolist(), common.to_numpy(state["episode"])
+        if envs != sorted(set(envs)):
+            raise InvalidInputError(
+                "env_idx: ManiSkill sets rows by a mask; give ascending numbers and the state's rows so"
+            )
         starts = []
         for row, name in enumerate(names_from_array(episode["object"])):
-            if self.gpu_sim_enabled and name != self.object_name[envs[row]]:  # GPU only
+            if self.gpu_sim_enabled and name != self.object_name[envs[row]]:
                 raise InvalidInputError(f"state: of {name!r}; a GPU scene keeps {self.object_name[envs[row]]!r}")
             qpos = episode["start"][row] if "start" in episode else np.zeros(NUM_JOINTS, dtype=np.float32)
             starts.append(Start(self._starts.load(name), int(episode["pose"][row]), qpos))

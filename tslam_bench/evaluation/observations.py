@@ -14,7 +14,10 @@ Observation = dict[str, NDArray]
 
 def to_numpy(value: Any) -> NDArray:
     """A tensor on any device, or an array, as a numpy array that shares no memory with the environment."""
-    return value.detach().cpu().numpy().copy() if hasattr(value, "detach") else np.array(value)
+    if not hasattr(value, "detach"):
+        return np.array(value)
+    array = value.detach().cpu().numpy()
+    return array.copy() if value.device.type == "cpu" else array  # from a device it is a copy already
 
 
 def observation_to_numpy(observation: Mapping[str, Any]) -> Observation:

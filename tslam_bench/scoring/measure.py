@@ -17,6 +17,7 @@ from tslam_bench.geometry.sampling import IouPoints
 from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring import metrics
+from tslam_bench.scoring.flags import right_where_unfelt, unfelt_surface
 from tslam_bench.scoring.prediction import prepare
 from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.score_file import CURVE_SPACING, ObjectScore
@@ -38,6 +39,8 @@ SHAPE_METRICS: Final = {
     "f_score_2": 0.0,
 }
 """Metrics of a reconstruction -> worst value, which an empty prediction is given. Metric units, squared or plain."""
+_Compared = tuple[dict[str, float | None], str | None, NDArray[np.float64] | None]
+"""Metrics, why the reconstruction counts as empty (or None), and the distance of each true sample to it (None if empty)."""
 CALIBRATION_METRICS: Final = {"calibration_error": 1.0, "brier": 1.0}
 """Metrics of a volume's probability -> worst value, which a missing reconstruction is given. A mesh has none."""
 
@@ -69,6 +72,13 @@ def score_object(submission: Submission, truth: Truth, record: VerificationRecor
 
     With a ``record`` of a replay, touches are the replay's, and an episode that did not reproduce counts as untouched.
     """
+    return [score for score, _ in score_seeds(submission, truth, record)]
+
+
+def score_seeds(
+    submission: Submission, truth: Truth, record: VerificationRecord | None = None
+) -> list[tuple[ObjectScore, float | None]]:
+    """:func:`score_object`, and how right the shape of one pose is where nothing was felt (:func:`right_where_unfelt`)."""
     scorer = _Scorer(truth)
     return [_score_seed(submission, scorer, seed, record) for seed in submission.info.seeds]
 
@@ -78,13 +88,13 @@ class _Scorer:
 
     def __init__(self, truth: Truth) -> None:
         self.truth = truth
-        self._last: tuple[Volume, tuple[dict[str, float | None], str | None]] | None = None
+        self._last: tuple[Volume, _Compared] | None = None
 
-    def score(self, reconstruction: Reconstruction | None) -> tuple[dict[str, float | None], str | None]:
+    def score(self, reconstruction: Reconstruction | None) -> _Compared:
         if not isinstance(reconstruction, Volume):
-            return score_reconstruction(reconstruction, self.truth)
+            return _compare(reconstruction, self.truth)
         if self._last is None or not _same(self._last[0], reconstruction):
-            self._last = reconstruction, score_reconstruction(reconstruction, self.truth)
+            self._last = reconstruction, _compare(reconstruction, self.truth)
         return self._last[1]
 
 
@@ -92,7 +102,9 @@ def _same(first: Volume, second: Volume) -> bool:
     return first.interpolation == second.interpolation and np.array_equal(first.probability, second.probability)
 
 
-def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: VerificationRecord | None) -> ObjectScore:
+def _score_seed(
+    submission: Submission, scorer: _Scorer, seed: int, record: VerificationRecord | None
+) -> tuple[ObjectScore, float | None]:
     truth = scorer.truth
     name = truth.prepared.name
     rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
@@ -108,6 +120,7 @@ def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: Veri
     surface = metrics.surface_iou_curve(touched_step, truth.prepared.surface, total)
     poses: dict[str, dict[str, float | None]] = {}
     reasons: dict[str, str | None] = {}
+    right: float | None = None
     for count, members in RECONSTRUCTED_POSES.items():
         touch: dict[str, float | None] = {
             "surface_iou": float(surface[count * HORIZON]),
@@ -123,7 +136,10 @@ def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: Veri
             why = "are missing" if stored.isdisjoint(absent) else why
             reason = f"rollouts of poses {', '.join(map(str, absent))} {why}"
             reconstruction = None
-        shape, found = scorer.score(reconstruction)
+        shape, found, completeness = scorer.score(reconstruction)
+        if count == 1 and completeness is not None and not reference:
+            felt = (touched_step >= 0) & (touched_step < HORIZON)
+            right = right_where_unfelt(unfelt_surface(felt, truth.prepared.surface_points), completeness)
         poses[str(count)] = {**shape, **(dict.fromkeys(touch) if reference else touch)}
         reasons[str(count)] = reason or found
 
@@ -131,7 +147,7 @@ def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: Veri
         "exploration_area": metrics.area_under_curve(recall),
         "exploration_surface_iou_area": metrics.area_under_curve(surface),
     }
-    return ObjectScore(
+    score = ObjectScore(
         object=name,
         seed=seed,
         poses=poses,
@@ -145,12 +161,18 @@ def _score_seed(submission: Submission, scorer: _Scorer, seed: int, record: Veri
         implausible_touches=implausible_touches(touched_step >= 0, truth.prepared),
         missing=missing,
     )
+    return score, right
 
 
 def score_reconstruction(
     reconstruction: Reconstruction | None, truth: Truth
 ) -> tuple[dict[str, float | None], str | None]:
     """Shape and calibration metrics of one reconstruction, and why it counts as empty (or None)."""
+    values, reason, _ = _compare(reconstruction, truth)
+    return values, reason
+
+
+def _compare(reconstruction: Reconstruction | None, truth: Truth) -> _Compared:
     prepared, weights = truth.prepared, truth.iou_points.weights
     prediction = prepare(reconstruction, truth.iou_points.points)
     if reconstruction is None:
@@ -164,9 +186,9 @@ def score_reconstruction(
             "brier": metrics.brier_score(*at_points),
         }
     if prediction.reason is not None:
-        return {**SHAPE_METRICS, **calibration}, prediction.reason
+        return {**SHAPE_METRICS, **calibration}, prediction.reason, None
     match = metrics.match_surfaces(metrics.to_metric(prediction.points), truth.surface)
-    return {
+    values = {
         "iou": metrics.iou(prediction.solid, prepared.solid_at_iou_points, weights),
         "iou_raw": metrics.iou(prediction.solid, prepared.raw_solid_at_iou_points, weights),
         "chamfer_l2": metrics.chamfer_l2(match),
@@ -175,7 +197,8 @@ def score_reconstruction(
         "f_score_1": metrics.f_score(match, F_SCORE_DISTANCES[0]),
         "f_score_2": metrics.f_score(match, F_SCORE_DISTANCES[1]),
         **calibration,
-    }, None
+    }
+    return values, None, match.completeness
 
 
 def merge_touched_steps(rollouts: dict[int, Rollout | None]) -> NDArray[np.int64]:

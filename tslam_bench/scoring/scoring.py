@@ -19,7 +19,8 @@ from tslam_bench.errors import AssetError
 from tslam_bench.objects.splits import object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.aggregate import Estimate, estimate_all
-from tslam_bench.scoring.measure import load_truth, score_object
+from tslam_bench.scoring.flags import copy_flags, unfelt_flags
+from tslam_bench.scoring.measure import load_truth, score_seeds
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, Submission, read_submission
 from tslam_bench.scoring.verification import VerificationRecord, find_record
@@ -76,11 +77,14 @@ def score_submission(
     parts = [submission.of_object(name) for name in names]
     records = [record and record.of_object(name) for name in names]
     results: list[ObjectScore] = []
+    right: list[float | None] = []
     scored = (pool.map if pool else map)(_score_part, parts, names, records, [cache] * len(names))
     for done, scores in enumerate(scored, start=1):
-        results += scores
+        results += [score for score, _ in scores]
+        right += [share for _, share in scores]
         if on_progress:
             on_progress(done, len(names))
+    flags = [] if submission.info.privileged else [*copy_flags(submission, results), *unfelt_flags(right)]
     return SubmissionScore(
         info=submission.info,
         content_hash=submission.content_hash,
@@ -88,15 +92,15 @@ def score_submission(
         asset_sha256=asset_sha256(names, cache=cache),
         results=tuple(results),
         aggregate=aggregate(results, len(names)),
-        notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record)),
+        notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record), *flags),
         verified=record is not None,
     )
 
 
 def _score_part(
     part: Submission, name: str, record: VerificationRecord | None, cache: Path | None
-) -> list[ObjectScore]:
-    return score_object(part, load_truth(name, cache), record)
+) -> list[tuple[ObjectScore, float | None]]:
+    return score_seeds(part, load_truth(name, cache), record)
 
 
 def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:

@@ -103,6 +103,10 @@ class Submission:
                 return _reconstruction(self._read(name), name, self.location)
         return None
 
+    def digest(self, name: str) -> str:
+        """SHA-256 of one of its files; empty if it does not hold it."""
+        return self._digests.get(name, "")
+
     def rollouts_hash(self, object_name: str, seed: int) -> str:
         """SHA-256 over an object's rollouts, the same in every submission of one exploration; empty if there are none."""
         names = [rollout_name(object_name, pose, seed) for pose in EXPLORATION_ORDER]

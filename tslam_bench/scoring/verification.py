@@ -51,7 +51,7 @@ class Tolerances:
     """Farthest of the other joints at a segment's end (rad)."""
     beyond: float = 0.25
     """Share of an episode's segments that may end further away, where a contact went the other way."""
-    far: float = 5.0
+    far: float = 10.0
     """How many times further even those may not be."""
     touches: float = 0.15
     """Share of the stored touched voxels (three voxels at least) that may have no replayed one among their neighbours."""

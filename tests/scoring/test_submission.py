@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import stat
+import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -412,6 +413,69 @@ def test_a_small_file_that_claims_a_large_array_is_refused_before_it_is_unpacked
             np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": (200, 28)})
             stream.write(zeros)
     refused(folder, ROLLOUT, "actions is truncated or too long")
+
+
+def peak_of_reading(path: Path, *fragments: str) -> float:
+    """Peak of allocated memory (bytes) while ``path`` is refused."""
+    tracemalloc.start()
+    try:
+        refused(path, *fragments)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_a_header_that_claims_to_be_long_is_not_read(folder: Path, version: int) -> None:
+    """A header of 60 kB, or of 1 GiB that the file deflates to 1 MB."""
+    with zipfile.ZipFile(folder / VOLUME, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        with archive.open("probability.npy", "w") as stream:
+            claimed = 60_000 if version == 1 else 2**30
+            stream.write(b"\x93NUMPY" + bytes([version, 0]) + claimed.to_bytes(2 if version == 1 else 4, "little"))
+            for _ in range(1 if version == 1 else 1024):
+                stream.write(b" " * min(claimed, 2**20))
+        with archive.open("interpolation.npy", "w") as stream:
+            np.lib.format.write_array(stream, np.array("linear"))
+    assert (folder / VOLUME).stat().st_size < 2e6
+    assert peak_of_reading(folder, VOLUME, "damaged header") < 20e6
+
+
+def bare_zip(entries: int) -> bytes:
+    """An archive that lists very many entries, all the same empty file."""
+    local = b"PK\3\4" + bytes(26)
+    entry = b"PK\1\2" + bytes(24) + (1).to_bytes(2, "little") + bytes(16) + b"x"
+    listed = entry * entries
+    end = b"PK\5\6" + bytes(4) + 2 * min(entries, 65535).to_bytes(2, "little")
+    return local + listed + end + len(listed).to_bytes(4, "little") + len(local).to_bytes(4, "little") + bytes(2)
+
+
+@pytest.mark.parametrize("kind", ["npz", "zip"])
+def test_an_archive_of_very_many_entries_is_not_opened(folder: Path, kind: str) -> None:
+    """1,200,000 entries in 56 MB: an object of each would take 700 MB."""
+    data = bare_zip(1_200_000)
+    with zipfile.ZipFile(io.BytesIO(bare_zip(1000))) as archive:
+        assert len(archive.infolist()) == 1000
+    if kind == "npz":
+        (folder / VOLUME).write_bytes(data)
+        peak = peak_of_reading(folder, VOLUME, "its list of entries has 56400000 bytes; at most 16384 are read")
+    else:
+        (folder.parent / "many.zip").write_bytes(data)
+        peak = peak_of_reading(folder.parent / "many.zip", "its list of entries has 56400000 bytes")
+    assert peak < 150e6
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_arrays_in_an_unusual_compression_are_refused(folder: Path, compression: int) -> None:
+    """Such unpackers take what memory the file asks for."""
+    with zipfile.ZipFile(folder / VOLUME, "w", compression) as archive:
+        for name, array in {
+            "probability": np.zeros((8, 8, 8), np.float16),
+            "interpolation": np.array("linear"),
+        }.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array)
+            archive.writestr(f"{name}.npy", member.getvalue())
+    refused(folder, VOLUME, "unusual compression", "numpy.savez_compressed")
 
 
 @pytest.mark.parametrize("name", [ROLLOUT, VOLUME, "reconstructions/mug_4_seed0.ply"])

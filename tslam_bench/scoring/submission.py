@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import io
 import json
 import re
 from collections.abc import Collection, Mapping
@@ -33,6 +32,7 @@ from tslam_bench.scoring.info import SubmissionInfo, parse_info
 from tslam_bench.scoring.rollout import OBJECT_NAME, Rollout, parse_rollout_file, rollout_file
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 from tslam_bench.scoring.untrusted_files import FileSource, open_source
+from tslam_bench.scoring.untrusted_mesh import MAX_MESH_ELEMENTS, read_ply
 
 INFO_FILE: Final = "submission.json"
 ROLLOUTS: Final = "rollouts/"
@@ -40,8 +40,6 @@ MAX_INFO_SIZE: Final = 64 * 2**10
 """Bytes of submission.json."""
 MAX_RESOLUTION: Final = 256
 """Largest R of a probability grid (R, R, R)."""
-MAX_MESH_ELEMENTS: Final = 1_000_000
-"""Most vertices, and most faces, of a ``.ply`` reconstruction."""
 
 EXPLORATION_ORDER: Final = PROTOCOL_POSES[4] + tuple(k for k in PROTOCOL_POSES[8] if k not in PROTOCOL_POSES[4])
 """Poses in the order of the exploration curve: its first four are the 4-pose protocol."""
@@ -315,32 +313,9 @@ def reconstruction_name(object_name: str, count: int, seed: int, suffix: str) ->
 def _reconstruction(data: bytes, name: str, location: str) -> Reconstruction:
     where = f"{location}: {name}"
     if name.endswith(".ply"):
-        return _read_ply(data, where)
+        return read_ply(data, where)
     arrays = read_npz(data, _RECONSTRUCTION_ARRAYS, where)
     try:
         return Volume(arrays["probability"].astype(np.float32), str(arrays["interpolation"]))  # type: ignore[arg-type]
     except InvalidInputError as error:
         raise InvalidInputError(f"{where}: {error}") from error
-
-
-def _read_ply(data: bytes, where: str) -> trimesh.Trimesh:
-    """A triangle mesh from a PLY file: element counts are checked in the header before anything is allocated."""
-    header, end, _ = data[:8192].partition(b"end_header")
-    counts = dict(re.findall(rb"^element (\w+) (\d{1,18})\s*$", header, re.MULTILINE))
-    if not data.startswith(b"ply") or not end or b"vertex" not in counts or b"face" not in counts:
-        raise InvalidInputError(f"{where}: not a PLY mesh with vertices and faces; export a triangle mesh")
-    for element, count in counts.items():
-        if int(count) > MAX_MESH_ELEMENTS:
-            raise InvalidInputError(f"{where}: {int(count)} {element.decode()} elements; at most {MAX_MESH_ELEMENTS}")
-    try:
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
-    except Exception as error:  # the parser raises whatever its libraries raise on damaged input
-        reason = " ".join(str(error).split())[:100]
-        raise InvalidInputError(f"{where}: damaged PLY file ({reason}); export it again") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InvalidInputError(f"{where}: holds no single triangle mesh; export one")
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    if len(vertices) != int(counts[b"vertex"]) or (len(faces) and (faces.min() < 0 or faces.max() >= len(vertices))):
-        raise InvalidInputError(f"{where}: truncated, or faces refer to missing vertices; export it again")
-    return trimesh.Trimesh(vertices, faces, process=False)

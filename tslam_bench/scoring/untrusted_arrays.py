@@ -12,12 +12,18 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import IO
+from typing import IO, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.scoring.untrusted_zip import COMPRESSIONS, open_zip
+
+MAX_DIRECTORY: Final = 16 * 2**10
+"""Bytes of the list of arrays in an ``.npz`` file."""
+MAX_HEADER: Final = 4 * 2**10
+"""Bytes of an array's header; numpy writes 128."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ def read_npz(
         InvalidInputError: truncated, pickled, arrays missing or unknown, wrong data type or shape.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with open_zip(io.BytesIO(data), MAX_DIRECTORY) as archive:
             names = archive.namelist()
             wanted = {f"{name}.npy": name for name in expected}
             if sorted(names) != sorted(wanted):
@@ -86,6 +92,8 @@ def read_npz(
 
 def _read_array(archive: zipfile.ZipFile, name: str, expected: Expected, where: str) -> NDArray:
     label = name.removesuffix(".npy")
+    if archive.getinfo(name).compress_type not in COMPRESSIONS:
+        raise InvalidInputError(f"{where}: {label} uses an unusual compression; save it with numpy.savez_compressed")
     with archive.open(name) as stream:
         shape, fortran, dtype = _read_header(stream, f"{where}: {label}")
         if dtype.hasobject:
@@ -104,8 +112,15 @@ def _read_array(archive: zipfile.ZipFile, name: str, expected: Expected, where: 
 def _read_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, Fortran order and data type of the array that follows in ``stream``."""
     try:
-        version = np.lib.format.read_magic(stream)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-        return read(stream)
+        magic = stream.read(8)
+        version = np.lib.format.read_magic(io.BytesIO(magic))
+        length, read = {
+            (1, 0): (2, np.lib.format.read_array_header_1_0),
+            (2, 0): (4, np.lib.format.read_array_header_2_0),
+        }[version]
+        size = stream.read(length)
+        if int.from_bytes(size, "little") > MAX_HEADER:
+            raise ValueError("too long")
+        return read(io.BytesIO(size + stream.read(int.from_bytes(size, "little"))))
     except Exception as error:  # numpy parses the header as Python source: damage raises nearly anything
         raise InvalidInputError(f"{where} has a damaged header; save it with numpy.savez_compressed") from error

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.scoring.untrusted_zip import COMPRESSIONS, open_zip
 
 MAX_FILES: Final = 20_000
 """Files in a submission."""
@@ -25,6 +26,8 @@ MAX_FILE_SIZE: Final = 64 * 2**20
 """Bytes of one uncompressed file: 64 MiB."""
 MAX_TOTAL_SIZE: Final = 8 * 2**30
 """Bytes of all uncompressed files: 8 GiB."""
+MAX_DIRECTORY: Final = 8 * 2**20
+"""Bytes of an archive's list of entries: 400 for each of the most files."""
 MAX_COMPRESSION_RATIO: Final = 100
 """Uncompressed to compressed bytes of a zip entry above ``RATIO_FREE_SIZE``."""
 RATIO_FREE_SIZE: Final = 2**20
@@ -137,7 +140,7 @@ class ZipSource(FileSource):
     @functools.cached_property
     def _archive(self) -> zipfile.ZipFile:
         try:
-            return zipfile.ZipFile(self._path)
+            return open_zip(self._path, MAX_DIRECTORY)
         except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
             raise InvalidInputError(f"{self._path}: not a readable zip archive ({error}); pack it again") from error
 
@@ -192,7 +195,7 @@ def _check_entry(location: str, entry: zipfile.ZipInfo) -> None:
         raise InvalidInputError(f"{location}: {name} is a link or special file; replace it with the file itself")
     if entry.flag_bits & 0x1:
         raise InvalidInputError(f"{location}: {name} is encrypted; pack it without a password")
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+    if entry.compress_type not in COMPRESSIONS:
         raise InvalidInputError(f"{location}: {name} uses an unusual compression; pack it with deflate")
     if entry.file_size > RATIO_FREE_SIZE and entry.file_size > MAX_COMPRESSION_RATIO * max(entry.compress_size, 1):
         raise InvalidInputError(

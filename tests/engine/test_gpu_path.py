@@ -22,7 +22,7 @@ from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
 from tslam_bench.engine.control import DriveTargets
 from tslam_bench.engine.field_atlas import FieldAtlas
 from tslam_bench.engine.gpu_memory import CONTACTS_PER_PAIR, HAND_SHAPES, TOUCHING_PAIRS, gpu_memory
-from tslam_bench.engine.hand_agent import _finite
+from tslam_bench.engine.hand_agent import _finite, matrices_from_poses
 from tslam_bench.engine.hand_batch import BatchSettings, HandBatch
 from tslam_bench.engine.native_output import captured_output
 from tslam_bench.engine.rewards import Rewards
@@ -72,6 +72,10 @@ def begun(mode: str, device: str | None) -> tuple[Sensing, Rewards]:
     return sensing, rewards
 
 
+ROUNDED = ("knn", "disagreement", "chamfer")
+"""Modes with sums over many numbers, which numpy and torch add in another order; all others are equal to the last bit."""
+
+
 @pytest.mark.parametrize("mode", REWARD_MODES)
 def test_tensors_on_real_episodes_are_the_cpu_engine_in_every_reward_mode(simulated, mode):
     links, _, _ = simulated
@@ -86,7 +90,10 @@ def test_tensors_on_real_episodes_are_the_cpu_engine_in_every_reward_mode(simula
         np.testing.assert_array_equal(host.link_touch(), device.link_touch().numpy())
         expected, found = host_rewards.step(a), device_rewards.step(b)
         assert found.dtype == torch.float32 and found.shape == (ENVS,)
-        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-3, atol=1e-3, err_msg=f"step {step}")
+        if mode in ROUNDED:
+            np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=5e-5, err_msg=f"step {step}")
+        else:
+            np.testing.assert_array_equal(found.numpy(), expected, err_msg=f"step {step}")
     for name in ("touched", "visited", "touched_step"):
         np.testing.assert_array_equal(getattr(host, name), getattr(device, name).numpy(), err_msg=name)
     assert felt > 500, "the comparison has to include contact"
@@ -119,13 +126,15 @@ def test_a_step_makes_no_host_copies(mode):
     """On torch's meta device nothing has a value: whatever asks for one fails. ``disagreement`` has to: qhull is on the host."""
     sensing, rewards = begun(mode, "meta")
     targets = DriveTargets(CONTROL_MODES[0], sensing.backend)
-    links = torch.zeros((ENVS, len(SKIN_LINKS), 3, 4), device="meta")
+    bodies = torch.zeros((100, 13), device="meta")
+    rows = torch.zeros((ENVS, len(SKIN_LINKS)), dtype=torch.int64, device="meta")
     steps = torch.zeros(ENVS, dtype=torch.int32, device="meta")
     action, qpos = (torch.zeros((ENVS, NUM_JOINTS), device="meta") for _ in range(2))
 
     def step():
         with NoHostCopies():
-            assert targets(action, qpos).shape == (ENVS, NUM_JOINTS)
+            links = matrices_from_poses(bodies[rows, :7])
+            assert targets(_finite(action), _finite(qpos)).shape == (ENVS, NUM_JOINTS)
             contacts = sensing.step(links, steps)
             sensing.link_touch()
             assert rewards.step(contacts).shape == (ENVS,)

@@ -118,8 +118,9 @@ class FieldAtlas:
         needed = len(self._fields)
         if self._values is None or size > self._slot_size or needed * self._slot_size > len(self._values):
             self._slot_size = max(self._slot_size, size)
+            # At first as many as there are: the objects of a GPU scene stay. Later twice as many, for episodes to come.
+            slots = needed if self._values is None else min(self._limit, max(4, 2 * needed))
             self._values = None  # frees the old array before the new one is made
-            slots = min(self._limit, max(4, 2 * needed))
             self._values = self._backend.full((slots * self._slot_size,), 0, self._dtype)
             changed = list(range(needed))
         for slot in changed:

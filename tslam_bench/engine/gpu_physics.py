@@ -52,12 +52,14 @@ def machine_identity() -> dict[str, str]:
     import torch
 
     versions = {name: importlib.metadata.version(name) for name in ("mani_skill", "sapien")}
-    card = {
-        "card": torch.cuda.get_device_name(),
+    card = torch.cuda.get_device_name()  # GPU only
+    return {
+        "card": card,
         "cuda": str(torch.version.cuda),
         "torch": str(torch.__version__),
-    }  # GPU only
-    return {"tslam_bench": __version__, **versions, **card}
+        "tslam_bench": __version__,
+        **versions,
+    }
 
 
 def gpu_check_passed(environment_id: str) -> bool:

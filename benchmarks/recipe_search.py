@@ -245,7 +245,7 @@ def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
     )
     header = (
         *("candidate", "seed", "touched voxels, sampled", "by the mean", "surface after 1 / all poses"),
-        *("on train", "std", "KL", "clipped", "min"),
+        *("on train", "std", "KL", "clipped", "steps/s"),
     )
     for steps in sorted({line["steps"] for line in lines}, reverse=True):
         rows = []
@@ -261,7 +261,7 @@ def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
             row += [f"{line['mean']['touched']:.0f}" if trained else "", recall]
             names = ("touched_voxels", "std", "approximate_kl", "clip_fraction")
             row += [f"{trained[n]:.{d}f}" for n, d in zip(names, (0, 2, 3, 2), strict=True)] if trained else [""] * 4
-            rows.append((*row, f"{line['seconds'] / 60:.1f}"))
+            rows.append((*row, f"{line['steps'] / line['train_seconds']:.0f}" if trained else ""))
         title = f"{steps:,} control steps" if steps else "Without training"
         text += f"{title}:\n\n{markdown_table(header, rows)}\n"
     return text

@@ -47,6 +47,8 @@ BROAD: Final[dict[str, Any]] = {"initial_std": 1.0, "initial_arm_std": 0.3}
 """Fingers move more than the arm."""
 CALM: Final[dict[str, Any]] = {**AIM, "initial_arm_std": 0.3, "clock": 5}
 """The arm moves less than the fingers, and the policy is given a clock."""
+MYOPIC: Final[dict[str, Any]] = {"gamma": 0.9, "gae_lambda": 0.8}
+"""What an action earned soon counts, and little of the noise of all that follows."""
 REPEAT: Final[dict[int, dict[str, Any]]] = {
     repeat: {"action_repeat": repeat, "gamma": round(0.97 ** (repeat / 4), 4), "batch_size": 1600 // repeat}
     for repeat in (1, 2, 8)
@@ -63,7 +65,7 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "std 1": {"initial_std": 1.0, "initial_arm_std": 1.0},
     "gamma .99": {"gamma": 0.99},
     "gamma .9": {"gamma": 0.9},
-    "gamma .9, lambda .8": {"gamma": 0.9, "gae_lambda": 0.8},
+    "gamma .9, lambda .8": MYOPIC,
     "hand": {"network": "hand"},
     "clip joints": {"clip_each_joint": True},
     "std rate 10": {"std_learning_rate": 10.0},
@@ -87,18 +89,18 @@ CANDIDATES: Final[dict[str, dict[str, Any]]] = {
     "aim, broad fingers, clock, lr decay": {**AIM, **BROAD, "clock": 5, "final_learning_rate": 0.1},
     "aim, broad fingers, clock, hand": {**AIM, **BROAD, "clock": 5, "network": "hand"},
     "aim, broad fingers, clock, clip joints": {**AIM, **BROAD, "clock": 5, "clip_each_joint": True},
-    "aim, broad fingers, gamma .9, lambda .8": {**AIM, **BROAD, "gamma": 0.9, "gae_lambda": 0.8},
+    "aim, broad fingers, gamma .9, lambda .8": {**AIM, **BROAD, **MYOPIC},
     "aim, broad fingers, std rate 10": {**AIM, **BROAD, "std_learning_rate": 10.0},
     "calm": CALM,
-    "calm, gamma .9, lambda .8": {**CALM, "gamma": 0.9, "gae_lambda": 0.8},
+    "calm, gamma .9, lambda .8": {**CALM, **MYOPIC},
     "calm, lambda .8": {**CALM, "gae_lambda": 0.8},
     "calm, state std": {**CALM, "state_std": True},
     "calm, repeat 2": {**CALM, "action_repeat": 2, "gamma": 0.985, "batch_size": 800},
     "calm, hand": {**CALM, "network": "hand"},
     "calm, lr 1e-3": {**CALM, "learning_rate": 1e-3, "target_kl": 0.2},
     "calm, 64 hands": {**CALM, "num_envs": 64, "batch_size": 800},
-    "calm, std rate 10": {**CALM, "std_learning_rate": 10.0},
-    "calm, std rate 10, lr decay": {**CALM, "std_learning_rate": 10.0, "final_learning_rate": 0.1},
+    "calm, gamma .9, lambda .8, lr decay": {**CALM, **MYOPIC, "final_learning_rate": 0.1},
+    "calm, gamma .9, lambda .8, std rate 10": {**CALM, **MYOPIC, "std_learning_rate": 10.0},
     "calm, no coverage": {**CALM, "baseline": "tslam_no_coverage"},
     "lr decay": {"final_learning_rate": 0.0},
     "64 hands": {"num_envs": 64, "batch_size": 800},
@@ -243,7 +245,7 @@ def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
     )
     header = (
         *("candidate", "seed", "touched voxels, sampled", "by the mean", "surface after 1 / all poses"),
-        *("on train", "std", "KL", "clipped", "min"),
+        *("on train", "std", "KL", "clipped", "steps/s"),
     )
     for steps in sorted({line["steps"] for line in lines}, reverse=True):
         rows = []
@@ -259,7 +261,7 @@ def section(lines: Sequence[dict[str, Any]], objects: dict[str, Any]) -> str:
             row += [f"{line['mean']['touched']:.0f}" if trained else "", recall]
             names = ("touched_voxels", "std", "approximate_kl", "clip_fraction")
             row += [f"{trained[n]:.{d}f}" for n, d in zip(names, (0, 2, 3, 2), strict=True)] if trained else [""] * 4
-            rows.append((*row, f"{line['seconds'] / 60:.1f}"))
+            rows.append((*row, f"{line['steps'] / line['train_seconds']:.0f}" if trained else ""))
         title = f"{steps:,} control steps" if steps else "Without training"
         text += f"{title}:\n\n{markdown_table(header, rows)}\n"
     return text

@@ -192,6 +192,46 @@ def test_an_action_that_is_not_finite_stays_with_its_hand(free):
     assert torch.isfinite(reward).all()
 
 
+def test_a_simulation_that_broke_stays_in_its_scene_until_its_reset(free, monkeypatch):
+    """NaN in one hand's links, positions and velocities, as PhysX leaves it when a solver breaks."""
+    action = np.full((ENVS, NUM_JOINTS), -0.4, dtype=np.float32)
+    free.reset(seed=SEEDS)
+    free.step(action)
+    expected, *_ = free.step(action)
+    base = free.environment.unwrapped
+    system = base.scene.px
+
+    def breaks(name: str) -> None:
+        fetch = getattr(system, f"gpu_fetch_articulation_{name}")
+
+        def fetch_then_break() -> None:
+            fetch()
+            if name == "link_pose":
+                system.cuda_rigid_body_data.torch()[base.agent._skin_rows[1]] = torch.nan
+            else:
+                getattr(system, f"cuda_articulation_{name}").torch()[1] = torch.nan
+
+        monkeypatch.setattr(system, f"gpu_fetch_articulation_{name}", fetch_then_break)
+
+    free.reset(seed=SEEDS)
+    for name in ("link_pose", "qpos", "qvel"):
+        breaks(name)
+    before = free.faults.clone()
+    free.step(action)
+    found, reward, *_ = free.step(action)
+    assert (free.faults - before).tolist() == [0, 2, 0]
+    for key in expected:
+        assert torch.equal(found[key][[0, 2]], expected[key][[0, 2]]), key
+        assert torch.isfinite(found[key].float()).all()
+    assert torch.isfinite(reward).all()
+    assert torch.isfinite(system.cuda_articulation_target_qpos.torch()).all(), "the drives were handed NaN"
+    monkeypatch.undo()
+    fresh, _ = free.reset(seed=SEEDS)
+    again, *_ = free.step(action)
+    assert torch.isfinite(again["qpos"]).all() and again["qpos"][1].abs().max() > 0
+    assert (fresh["qpos"][1] != 0).any()
+
+
 def test_hands_never_sleep_on_a_gpu(free):
     base = free.environment.unwrapped
     assert base.sim_config.scene_config.sleep_threshold == 0

@@ -131,7 +131,9 @@ def _one_line(path: Path, errors: tuple[int, ...] | None = None) -> Iterator[Non
         if errors is not None and error.errno not in errors:
             raise
         reason = error.strerror or str(error)
-        raise AssetError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
+        raise AssetError(
+            f"{path}: cannot be written ({reason}); make room, or choose another place ({CACHE_VARIABLE} moves the cache)"
+        ) from error
 
 
 def _hidden(path: Path, ending: str = "") -> str:

@@ -19,7 +19,7 @@ from tslam_bench.objects.packs import decode, encode, pack_hand, pack_objects, u
 from tslam_bench.objects.splits import split_directory
 from tslam_bench.objects.store import ARRAYS, asset_sha256, damage, load_object
 
-NAMES = ["cubelarge", "hammer", "mug"]
+NAMES = ["cubemedium", "hammer", "mug"]
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_what_is_no_pack_is_one_line(tmp_path):
 
 
 def test_another_object_of_that_name_is_kept(packed, tmp_path):
-    target = split_directory("test", tmp_path) / "cubelarge"
+    target = split_directory("test", tmp_path) / "cubemedium"
     shutil.copytree(split_directory("test") / "cubesmall", target)
     before = (target / "field.npy").read_bytes()
     with pytest.raises(AssetError, match="another object"):

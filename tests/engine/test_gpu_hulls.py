@@ -33,8 +33,8 @@ def test_a_needle_is_refused_and_boxes_are_not():
 
 def test_hulls_of_the_quick_set_are_cooked_and_counted(tmp_path):
     report = tmp_path / "report.json"
-    command = [sys.executable, BENCHMARKS / "gpu_hulls.py", "--objects", "mug", "waterbottle", "--output", report]
+    command = [sys.executable, BENCHMARKS / "gpu_hulls.py", "--objects", "mug", "hammer", "--output", report]
     subprocess.run(command, check=True, capture_output=True)
     found = json.loads(report.read_text(encoding="utf-8"))
     assert found["objects"] == 2 and found["hulls"] > 60
-    assert [entry["object"] for entry in found["refused"]] == ["waterbottle"], "docs/gpu.md says so"
+    assert found["refused"] == [], "docs/gpu.md names the only test object with such a hull: waterbottle"

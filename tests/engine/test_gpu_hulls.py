@@ -36,5 +36,5 @@ def test_hulls_of_the_quick_set_are_cooked_and_counted(tmp_path):
     command = [sys.executable, BENCHMARKS / "gpu_hulls.py", "--objects", "mug", "hammer", "--output", report]
     subprocess.run(command, check=True, capture_output=True)
     found = json.loads(report.read_text(encoding="utf-8"))
-    assert found["objects"] == 2 and found["hulls"] > 60
+    assert found["objects"] == 2 and found["hulls"] > 40
     assert found["refused"] == [], "docs/gpu.md names the only test object with such a hull: waterbottle"

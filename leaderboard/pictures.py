@@ -18,16 +18,19 @@ from typing import Final, Literal
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from PIL import Image
 
 from tslam_bench.constants import GRID_SIZE, NUM_POSES, OCCUPANCY_THRESHOLD
+from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file
 from tslam_bench.geometry.render import Camera, Colour, fit_camera, render, voxels_to_mesh
+from tslam_bench.grids import voxel_centres
 from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring.measure import merge_touched_steps
-from tslam_bench.scoring.prediction import invalid_mesh
-from tslam_bench.scoring.submission import EXPLORATION_ORDER, Submission
+from tslam_bench.scoring.prediction import invalid_mesh, solid_in_mesh
+from tslam_bench.scoring.submission import EXPLORATION_ORDER, Reconstruction, Submission
 
 PICTURE_SIZE: Final = 232
 """Pixels across a picture; its height depends on the object."""
@@ -43,6 +46,10 @@ COLOURS: Final[dict[Kind, Colour]] = {
     "touched": (0.91, 0.50, 0.20),
     "reconstruction": (0.29, 0.53, 0.86),
 }
+MAX_DRAWN: Final = 1_000_000
+"""Triangles of a surface that is drawn as it is; of a larger one its voxels are drawn: 5 s and 1 GB on one core."""
+MAX_OVERLAP: Final = 1000.0
+""":func:`overlap` of a mesh that is drawn as it is: 7 s on one core. Ordinary meshes have less than 10."""
 _QUALITY: Final = 82
 
 
@@ -152,11 +159,43 @@ def _subject(picture: Picture, submission: Submission) -> trimesh.Trimesh:
         if any(rollouts.values()):
             return voxels_to_mesh(merge_touched_steps(rollouts) >= 0)
     reconstruction = submission.reconstruction(picture.object, NUM_POSES, picture.seed)
-    if isinstance(reconstruction, Volume):
-        if reconstruction.interpolation == "nearest" and reconstruction.resolution == GRID_SIZE:
-            return voxels_to_mesh(reconstruction.probability >= OCCUPANCY_THRESHOLD)
-        return reconstruction.to_mesh()
-    return nothing if reconstruction is None or invalid_mesh(reconstruction) else reconstruction
+    if reconstruction is None or (isinstance(reconstruction, trimesh.Trimesh) and invalid_mesh(reconstruction)):
+        return nothing
+    if isinstance(reconstruction, trimesh.Trimesh):
+        mesh = reconstruction
+    elif reconstruction.interpolation == "nearest" and reconstruction.resolution == GRID_SIZE:
+        return voxels_to_mesh(reconstruction.probability >= OCCUPANCY_THRESHOLD)
+    else:
+        try:
+            mesh = reconstruction.to_mesh(most=MAX_DRAWN)
+        except InvalidInputError:
+            return _in_voxels(reconstruction)
+    return mesh if overlap(mesh) <= MAX_OVERLAP else _in_voxels(reconstruction)
+
+
+def overlap(mesh: trimesh.Trimesh) -> float:
+    """How many boxes of faces a line through the mesh's box meets on average: what a ray costs."""
+    if len(mesh.faces) == 0:
+        return 0.0
+
+    def surface(extents: NDArray) -> NDArray:
+        return (extents * np.roll(extents, 1, axis=-1)).sum(axis=-1)
+
+    whole = surface(np.maximum(np.asarray(mesh.extents, dtype=np.float64), 1e-12))
+    return float(surface(np.ptp(np.asarray(mesh.triangles), axis=1)).sum() / whole)
+
+
+def _in_voxels(reconstruction: Reconstruction) -> trimesh.Trimesh:
+    """What is solid at the centres of the voxels: a picture of bounded cost."""
+    centres = voxel_centres().reshape(-1, 3)
+    try:
+        if isinstance(reconstruction, Volume):
+            solid = reconstruction.query(centres) >= OCCUPANCY_THRESHOLD
+        else:
+            solid = solid_in_mesh(reconstruction, centres)
+    except InvalidInputError:
+        return trimesh.Trimesh()
+    return voxels_to_mesh(solid.reshape((GRID_SIZE,) * 3))
 
 
 @lru_cache(maxsize=64)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 
 import igl
 import numpy as np
 import pytest
 import trimesh
+from hostile_shapes import slivers
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
 from tslam_bench.constants import VOXEL_EDGE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.geometry import isosurface
 from tslam_bench.grids import points_to_grid, voxel_centres
 from tslam_bench.reconstruction.volume import Volume
+from tslam_bench.scoring import prediction
 from tslam_bench.scoring.metrics import iou
-from tslam_bench.scoring.prediction import solid_in_mesh
+from tslam_bench.scoring.prediction import prepare, solid_in_mesh
 
 
 def tetrahedra_of_a_cell() -> np.ndarray:
@@ -200,10 +202,49 @@ def test_the_solid_follows_the_threshold() -> None:
         assert iou(solid_in_mesh(volume.to_mesh(threshold), points), volume.query(points) >= threshold) > 0.999
 
 
-def test_a_surface_beyond_all_bounds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(isosurface, "MAX_TRIANGLES", 1000)
-    with pytest.raises(InvalidInputError, match="more than 1,000 triangles"):
-        Volume(random_field(0)).to_mesh()
+@pytest.mark.parametrize("interpolation", ["nearest", "linear"])
+def test_a_surface_is_made_up_to_exactly_the_bound(interpolation) -> None:
+    volume = Volume(random_field(0), interpolation)
+    count = len(volume.to_mesh().faces)
+    assert len(volume.to_mesh(most=count).faces) == count
+    with pytest.raises(InvalidInputError, match=f"more than {count - 1:,} triangles; smooth it"):
+        volume.to_mesh(most=count - 1)
+
+
+@pytest.mark.parametrize(("interpolation", "size"), [("nearest", 256), ("linear", 256), ("linear", 96)])
+@pytest.mark.parametrize("field", [checkerboard, lambda size: random_field(0, size)])
+def test_a_surface_beyond_all_bounds_counts_as_empty_and_is_not_made(field, interpolation, size: int) -> None:
+    volume = Volume(field(size), interpolation)
+    tracemalloc.start()
+    try:
+        prediction = prepare(volume, np.zeros((1, 3)))
+        assert tracemalloc.get_traced_memory()[1] < 700e6  # the samples with a border around them, no triangles
+    finally:
+        tracemalloc.stop()
+    assert prediction.reason == (
+        "volume: the surface has more than 8,000,000 triangles; smooth it or lower its resolution"
+    )
+
+
+@pytest.mark.parametrize("count", [500, 40_000])
+def test_faces_right_across_the_mesh_do_not_each_cost_every_point(count: int, monkeypatch) -> None:
+    """A tree over such faces looks at all of them for every point: 160,000 for 100,000 points took an hour."""
+    mesh = slivers(count)
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, (100_000, 3))  # other numbers than the slivers' corners
+    monkeypatch.setattr(prediction, "_MOST_EVALUATIONS", 10_000_000)
+    counted = solid_in_mesh(mesh, points)
+    some = points[:: 100_000 // 200]
+    expected = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64), some) >= 0.5
+    np.testing.assert_array_equal(counted[:: 100_000 // 200], expected)
+    assert counted.any()
+
+
+def test_faces_that_are_too_much_work_make_an_empty_prediction(monkeypatch) -> None:
+    monkeypatch.setattr(prediction, "_MOST_EVALUATIONS", 1000)
+    monkeypatch.setattr(prediction, "_MOST_CROSSINGS", 1000)
+    found = prepare(slivers(100), np.random.default_rng(0).uniform(-0.1, 0.1, (1000, 3)))
+    assert found.reason == "the mesh has too many long faces to tell its inside from its outside"
+    assert not found.solid.any() and found.points.shape == (0, 3)
 
 
 def test_full_volume_fills_the_workspace() -> None:

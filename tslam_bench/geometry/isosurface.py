@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 APART: Final = 1e-4
 """Corners of the surface stay this far from the ends of the edges that they lie on, as a share of the edge. Where samples equal
 the level, corners of many triangles would be one point, and a mesh whose equal corners are merged would not be closed."""
-MAX_TRIANGLES: Final = 20_000_000
-"""Largest surface that is drawn. A smooth one in a volume of 256^3 has a tenth of this."""
 
 
 def _tetrahedra() -> NDArray[np.int64]:
@@ -119,19 +117,20 @@ def interpolate(values: NDArray, positions: NDArray) -> NDArray:
     return result
 
 
-def surface(values: NDArray, level: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def surface(values: NDArray, level: float, most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Boundary of the region where the field is at least ``level``, cut off half a cell beyond the outermost samples.
 
     Args:
         values: (R, R, R) float32 samples; the field goes on for half a cell beyond them, as it is there.
         level: the level.
+        most: triangles that are made at most.
 
     Returns:
         triangles (T, 3, 3): corners in cells from the lower corner of the whole (sample ``[i, j, k]`` at i + 0.5, ...),
         counter-clockwise seen from outside; keys (T, 3): equal where triangles share a corner.
 
     Raises:
-        ValueError: more than ``MAX_TRIANGLES``.
+        ValueError: there are more than ``most``; nothing was made then.
     """
     solid = values >= level
     shape = (0, 3, 3)
@@ -155,9 +154,9 @@ def surface(values: NDArray, level: float) -> tuple[NDArray[np.float64], NDArray
         places = np.concatenate([[ends[0] - 1, ends[0]], samples, [ends[1], ends[1] + 1]])
         axes[axis, : 2 * len(places) : 2] = places
         axes[axis, 1 : 2 * len(places) - 1 : 2] = (places[1:] + places[:-1]) / 2
-    count = _count(padded, level)
-    if count > MAX_TRIANGLES:
-        raise ValueError(f"the surface has more than {MAX_TRIANGLES:,} triangles")
+    count = _count(padded, level, most)
+    if count > most:
+        raise ValueError(f"the surface has more than {most:,} triangles")
     triangles, keys = np.empty((count, 3, 3)), np.empty((count, 3), dtype=np.int64)
     _fill(padded, axes, level, triangles, keys)
     return triangles, keys
@@ -192,11 +191,13 @@ def _cell_values(values: NDArray, i: int, j: int, k: int, nodes: NDArray) -> Non
 
 
 @njit(cache=True)
-def _count(values: NDArray, level: float) -> int:
-    """Number of triangles of the surface."""
+def _count(values: NDArray, level: float, most: int) -> int:
+    """Number of triangles of the surface; more than ``most`` are not all counted."""
     nodes = np.empty((3, 3, 3))
     total = 0
     for i in range(values.shape[0] - 1):
+        if total > most:
+            break
         for j in range(values.shape[1] - 1):
             for k in range(values.shape[2] - 1):
                 if not _crossed(values, level, i, j, k):

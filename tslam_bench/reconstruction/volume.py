@@ -6,7 +6,7 @@ numpy, numba and trimesh only, so that scoring can read it without torch or a si
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Final, Literal, Protocol, get_args
 
 import numpy as np
 import trimesh
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
 
+MAX_TRIANGLES: Final = 8_000_000
+"""Largest surface that is made: at most 1.5 GB on the way. A smooth one in a volume of 256^3 has a quarter of this, pure noise
+in one of 64^3 three quarters."""
 Interpolation = Literal["nearest", "linear"]
 
 
@@ -74,52 +77,73 @@ class Volume:
         return result if inside.all() else np.where(inside, result, np.float32(0))
 
     def triangles(self, threshold: float = OCCUPANCY_THRESHOLD) -> NDArray[np.float64]:
-        """The triangles of :meth:`to_mesh`, by their corners: (T, 3, 3) metres, object frame."""
-        return WORKSPACE_LOW + self.cell_edge * self._surface(threshold)[0]
+        """The triangles of :meth:`to_mesh`, by their corners: (T, 3, 3) metres, object frame.
 
-    def to_mesh(self, threshold: float = OCCUPANCY_THRESHOLD) -> trimesh.Trimesh:
+        Raises:
+            InvalidInputError: there are more than ``MAX_TRIANGLES``.
+        """
+        triangles = self._surface(threshold, MAX_TRIANGLES)[0]
+        triangles *= self.cell_edge
+        triangles += WORKSPACE_LOW
+        return triangles
+
+    def to_mesh(self, threshold: float = OCCUPANCY_THRESHOLD, most: int = MAX_TRIANGLES) -> trimesh.Trimesh:
         """Boundary of the region where :meth:`query` is at least ``threshold``: metres, object frame, faces outwards.
 
         Closed where the solid meets a face of W. Linear: watertight, exact to 1e-4 of a cell. Nearest: the faces of the solid
         cells, two triangles each, exact; watertight unless two solid cells share no more than an edge. Nothing solid: an
         empty mesh (0 vertices, 0 faces).
+
+        Raises:
+            InvalidInputError: it has more than ``most`` triangles.
         """
-        triangles, keys = self._surface(threshold)
+        triangles, keys = self._surface(threshold, most)
         _, first, corners = np.unique(keys, return_index=True, return_inverse=True)
         vertices = WORKSPACE_LOW + self.cell_edge * triangles.reshape(-1, 3)[first]
         return trimesh.Trimesh(vertices=vertices, faces=corners.reshape(-1, 3), process=False)
 
-    def _surface(self, threshold: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _surface(self, threshold: float, most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Triangles in cells from the lower corner of W (T, 3, 3), and the keys of their corners (T, 3)."""
         if not 0 < threshold < 1:
             raise InvalidInputError(f"threshold {threshold}: must lie strictly between 0 and 1")
-        if self.interpolation == "nearest":
-            return _cell_faces(self.probability >= threshold)
-        from tslam_bench.geometry.isosurface import surface
-
         try:
-            return surface(self.probability, threshold)
+            if self.interpolation == "nearest":
+                return _cell_faces(self.probability >= threshold, most)
+            from tslam_bench.geometry.isosurface import surface
+
+            return surface(self.probability, threshold, most)
         except ValueError as error:
             raise InvalidInputError(f"volume: {error}; smooth it or lower its resolution") from error
 
 
-def _cell_faces(solid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Faces between solid and empty cells, two outward triangles each: corners (T, 3, 3) and their keys (T, 3)."""
+def _cell_faces(solid: NDArray[np.bool_], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Faces between solid and empty cells, two outward triangles each: corners (T, 3, 3) and their keys (T, 3).
+
+    Raises:
+        ValueError: there are more than ``most`` triangles; nothing was made then.
+    """
     padded = np.pad(solid, 1)
-    quads = [np.zeros((0, 4, 3), dtype=np.int64)]
+    if 2 * sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3)) > most:
+        raise ValueError(f"the surface has more than {most:,} triangles")
+    quads = [np.zeros((0, 4, 3), dtype=np.int32)]
     for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3
         for side in (0, 1):
             neighbour = np.roll(padded, 1 if side == 0 else -1, axis=axis)
-            cells = np.argwhere(padded & ~neighbour) - 1
-            corner = np.zeros((4, 3), dtype=np.int64)
+            cells = np.argwhere(padded & ~neighbour).astype(np.int32) - 1
+            corner = np.zeros((4, 3), dtype=np.int32)
             corner[:, axis] = side
             corner[[1, 2], first] = 1
             corner[[2, 3], second] = 1
             quads.append(cells[:, None, :] + (corner if side else corner[::-1])[None])
     corners = np.concatenate(quads)
-    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    return triangles.astype(np.float64), np.ravel_multi_index(tuple(np.moveaxis(triangles, -1, 0)), padded.shape)
+    del quads
+    corner_keys = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), padded.shape)
+    count = len(corners)
+    triangles, keys = np.empty((2 * count, 3, 3)), np.empty((2 * count, 3), dtype=np.int64)
+    for part, half in ((slice(count), [0, 1, 2]), (slice(count, None), [0, 2, 3])):
+        triangles[part], keys[part] = corners[:, half], corner_keys[:, half]
+    return triangles, keys
 
 
 class Reconstructor(Protocol):

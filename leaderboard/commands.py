@@ -17,9 +17,10 @@ from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, check_output, ensure_writable_directory, write_json
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.score_file import SubmissionScore, is_score_file
+from tslam_bench.scoring.score_file import SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import INFO_FILE, Submission, read_submission
+from tslam_bench.scoring.untrusted_scores import is_score_file, read_score
 from tslam_bench.scoring.verification import find_record
 
 from .page import build_page
@@ -44,6 +45,9 @@ class LeaderboardArguments:
     """Folder for the page."""
     scores: Path | None = None
     """Folder of score files; their submissions are looked for in the folder submissions/ beside it."""
+    trust_scores: bool = False
+    """Take the figures of score files that were made elsewhere as they are, even where their submissions are at hand and
+    could be scored. They never count as replayed."""
     pictured: int = 12
     """Objects in the gallery, the quick ones first; 0 leaves the gallery out."""
     workers: int = 1
@@ -66,13 +70,13 @@ def page_main(arguments: Sequence[str]) -> None:
     score_files, submission_paths = find_inputs(paths)
     if not score_files and not submission_paths:
         raise InvalidInputError(f"{paths[0]}: holds neither submissions nor score files; run tslam-bench score first")
-    scores = [_read_score(path) for path in score_files]
+    scores = [read_score(path) for path in score_files]
     submissions: dict[str, Submission] = {}
     for path in submission_paths:
         submission = read_submission(path)
         submissions.setdefault(submission.content_hash, submission)
     _check_output(parsed.output)  # before hours of scoring, not after
-    scores = _score_missing(scores, submissions, parsed.workers)
+    scores = _score_missing(scores, submissions, parsed.workers, parsed.trust_scores)
     leaderboard = rank(scores)
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
@@ -159,12 +163,15 @@ def plan_pictures(
 
 
 def _score_missing(
-    scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int
+    scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int, trust: bool
 ) -> list[SubmissionScore]:
-    """Adds scores of submissions that have none; one of other assets, or from before the replay beside them, does not count."""
-    current = [score for score in scores if _is_current(score, submissions.get(score.content_hash))]
+    """Adds scores of submissions that have none.
+
+    One of other assets, or from before the replay beside them, does not count, nor (without ``trust``) one made elsewhere.
+    """
+    current = [score for score in scores if _is_current(score, submissions.get(score.content_hash), trust)]
     scored = {score.content_hash for score in current}
-    before = {score.content_hash: score.objects for score in scores}
+    before = {score.content_hash: score.objects for score in scores if score.made_here or trust}
     missing = [submission for key, submission in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for submission in missing:
@@ -174,20 +181,14 @@ def _score_missing(
     return current
 
 
-def _is_current(score: SubmissionScore, submission: Submission | None) -> bool:
+def _is_current(score: SubmissionScore, submission: Submission | None, trust: bool) -> bool:
     if submission is None:
         return True
+    if not (score.made_here or trust):
+        return False
     try:
         if not score.verified and find_record(submission, score.objects)[0] is not None:
             return False
         return score.asset_sha256 == asset_sha256(score.objects)
     except AssetError:
         return True  # the objects are not here: the score is the best there is
-
-
-def _read_score(path: Path) -> SubmissionScore:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"{path}: not a score file ({error}); score the submission again") from error
-    return SubmissionScore.from_json(value, str(path))

@@ -8,6 +8,7 @@ score puts them, without a rank, and lead no group.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -30,12 +31,13 @@ def rank(scores: Sequence[SubmissionScore]) -> dict[str, Any]:
     """The content of leaderboard.json.
 
     Args:
-        scores: scored submissions; of several with the same files, one is kept.
+        scores: scored submissions; of several with the same files, the most trustworthy one is kept, in whatever order they come.
 
     Returns:
         a dict of plain values: ``tables``, each with its ``objects`` and its ``entries`` in the order of the ranking.
     """
-    distinct = list({(score.content_hash, score.objects): score for score in scores}.values())
+    scores = sorted(scores, key=_doubt, reverse=True)  # of equal keys, the last stays
+    distinct = list({(score.content_hash, tuple(sorted(score.objects))): score for score in scores}.values())
     groups: dict[tuple[str, ...], list[SubmissionScore]] = {}
     for score in distinct:
         groups.setdefault(tuple(sorted(score.objects)), []).append(score)
@@ -103,6 +105,11 @@ def _sort_key(score: SubmissionScore) -> tuple[Any, ...]:
     # Names last, so that the order never depends on the order of the files.
     names = (score.info.explorer, score.info.reconstructor, score.info.method, score.content_hash)
     return (-score.aggregate["areas"]["iou_area"].mean, -at_8["iou"].mean, at_8["chamfer_l2"].mean, *names)
+
+
+def _doubt(score: SubmissionScore) -> tuple[Any, ...]:
+    """Lower for figures that were made here, and of a replay; and what differs at all is told apart by its text."""
+    return not score.made_here, not score.verified, json.dumps(score.to_json(), sort_keys=True)
 
 
 def _entry(

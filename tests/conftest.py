@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from prepared_shapes import prepared_box, prepared_sphere, prepared_torus
 
+from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.objects.store import PreparedObject
 
 
@@ -47,5 +48,7 @@ def run(
     from scored_run import write_run
 
     folder = tmp_path_factory.mktemp("run")
-    write_run(folder, box, torus, primitive_cache)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(primitive_cache))  # its key seals the scores
+        write_run(folder, box, torus, primitive_cache)
     return folder

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
 from tslam_bench.scoring.scoring import score_submission
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
+from tslam_bench.scoring.untrusted_scores import write_score
 
 NAMES = ("mug", "toruslarge")
 
@@ -86,9 +86,7 @@ def write_run(folder: Path, box: PreparedObject, torus: PreparedObject, cache: P
     ]
     for name, about, reconstructor, share in cases:
         path = write_submission(folder / "submissions" / name, about, reconstructor, share, objects)
-        score = score_submission(path, NAMES, cache=cache)
-        (folder / "scores").mkdir(exist_ok=True)
-        (folder / "scores" / f"{name}.json").write_text(json.dumps(score.to_json()))
+        write_score(folder / "scores" / f"{name}.json", score_submission(path, NAMES, cache=cache))
 
 
 def fake_score(

@@ -15,9 +15,9 @@ from scored_run import NAMES, fake_score, info
 from tslam_bench.cli import main
 from tslam_bench.cli.score import object_table, score_main, summary_table
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.scoring.score_file import SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import SubmissionWriter, read_submission
+from tslam_bench.scoring.untrusted_scores import parse_score
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +30,7 @@ def test_score_prints_a_table_and_writes_json(run: Path, tmp_path: Path, capsys:
     score_main([str(path), "--objects", *NAMES, "--output", str(tmp_path / "score.json")])
     printed = capsys.readouterr().out
     value = json.loads((tmp_path / "score.json").read_text())
-    assert SubmissionScore.from_json(value, "file").objects == NAMES
+    assert parse_score(value, "file").objects == NAMES
     assert value == json.loads((run / "scores" / "mine-hull.json").read_text())
     for name in NAMES:
         assert name in printed

@@ -19,9 +19,9 @@ from tslam_bench.evaluation.verify import verify
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.scoring import score_submission
+from tslam_bench.scoring.seal import KEY_FILE
 from tslam_bench.scoring.submission import ROLLOUTS, Submission, SubmissionWriter, read_submission, rollout_name
 from tslam_bench.scoring.verification import (
-    KEY_FILE,
     Tolerances,
     VerificationRecord,
     pack_steps,

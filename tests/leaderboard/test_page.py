@@ -252,6 +252,53 @@ def test_a_page_destroys_no_submission_and_no_other_page(run: Path, tmp_path: Pa
     assert (tmp_path / "index.html").read_text() == "my home page"
 
 
+def forged(run: Path, name: str) -> dict:
+    """A stranger's score file of a submission: everything right everywhere, and verified."""
+    value = json.loads((run / "scores" / f"{name}.json").read_text())
+    for result in value["results"]:
+        for figures in result["poses"].values():
+            figures["iou"] = 1.0
+    for estimate in value["aggregate"]["areas"].values():
+        estimate["mean"] = 2.0
+    return {**value, "verified": True}
+
+
+def test_a_forged_score_file_beside_its_submission_counts_nothing(run: Path, tmp_path: Path) -> None:
+    """The submission is scored; and where it is not at hand, what was sent is shown as that."""
+    (tmp_path / "forged.json").write_text(json.dumps(forged(run, "random-grid")))
+    shutil.copytree(run / "submissions" / "random-grid", tmp_path / "random-grid")
+    true = json.loads((run / "scores" / "random-grid.json").read_text())["aggregate"]["areas"]["iou_area"]["mean"]
+    for arguments, mean, remark in (
+        (["forged.json", "random-grid"], true, False),
+        (["forged.json"], 1.0, True),
+        (["forged.json", "random-grid", "--trust-scores"], 1.0, True),
+    ):
+        paths = [str(tmp_path / argument) if argument[0] != "-" else argument for argument in arguments]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("tslam_bench.objects.splits.QUICK_OBJECTS", NAMES)
+            page_main([*paths, "--output", str(tmp_path / "page"), "--pictured", "0"])
+        (entry,) = json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]
+        text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
+        assert entry["aggregate"]["areas"]["iou_area"]["mean"] == pytest.approx(mean)
+        assert entry["verified"] is False and ">replayed<" not in text
+        assert ("scored elsewhere" in text) is remark
+
+
+def test_of_two_scores_of_one_submission_the_one_made_here_stays_in_any_order(run: Path, tmp_path: Path) -> None:
+    honest, lies = run / "scores" / "random-grid.json", tmp_path / "lies.json"
+    lies.write_text(json.dumps(forged(run, "random-grid")))
+    (tmp_path / "other.json").write_text(json.dumps(forged(run, "random-grid") | {"notes": ["another"]}))
+    boards = []
+    for paths in ([honest, lies], [lies, honest], [lies, tmp_path / "other.json"], [tmp_path / "other.json", lies]):
+        page_main([*map(str, paths), "--output", str(tmp_path / "page")])
+        boards.append((tmp_path / "page" / "leaderboard.json").read_bytes())
+    assert boards[0] == boards[1] != boards[2] == boards[3]
+    (entry,) = json.loads(boards[0])["tables"][0]["entries"]
+    assert (
+        entry["aggregate"]["areas"]["iou_area"]["mean"] < 1 and len(json.loads(boards[2])["tables"][0]["entries"]) == 1
+    )
+
+
 def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path: Path, monkeypatch) -> None:
     """A submission of the quick set needs all its objects: the message names the command that prepares them."""
     with pytest.raises(AssetError, match="assets prepare"):

@@ -16,11 +16,12 @@ from rich.table import Table
 
 from tslam_bench.cli.progress import Progress
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import check_output, write_json
+from tslam_bench.files import check_output
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
-from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore, is_score_file
+from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import Submission, read_submission
+from tslam_bench.scoring.untrusted_scores import is_score_file, sealed_json, write_score
 from tslam_bench.scoring.verification import VerificationRecord
 
 
@@ -61,9 +62,9 @@ def score_main(arguments: Sequence[str]) -> None:
                 record = records.get(submission.content_hash)
                 scores.append(score_submission(submission, parsed.objects or None, pool, bar.show, record=record))
             if file is not None:
-                write_json(file, scores[-1].to_json())
+                write_score(file, scores[-1])
     if parsed.json:
-        values = [score.to_json() for score in scores]
+        values = [sealed_json(score) for score in scores]
         print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
         return
     console = Console()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import math
 import re
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from tslam_bench.constants import (
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.plugins import IDENTIFIER
+from tslam_bench.scoring.untrusted_json import parse_json
 
 SCHEMA_VERSION: Final = 2
 """Version of the submission format. 2: rollouts hold joint checkpoints."""
@@ -174,10 +174,19 @@ def parse_info(text: bytes) -> SubmissionInfo:
         InvalidInputError: not JSON, a field is missing, unknown or not what it has to be.
     """
     try:
-        values = json.loads(text.decode("utf-8"), parse_constant=_refuse_constant)
-    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        values = parse_json(text)
+    except ValueError as error:
         reason = " ".join(str(error).split())[:120]
         raise InvalidInputError(f"not valid JSON ({reason}); see docs/submission.md for the format") from error
+    return check_info(values)
+
+
+def check_info(values: Any) -> SubmissionInfo:
+    """What JSON values say about a submission.
+
+    Raises:
+        InvalidInputError: a field is missing, unknown or not what it has to be.
+    """
     return _build(SubmissionInfo, values, "")
 
 
@@ -199,10 +208,6 @@ def _build(kind: type, values: Any, prefix: str) -> Any:
     if "training" in read:
         read["training"] = _build(Training, read["training"], "training.")
     return kind(**read)
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _text(value: Any, name: str) -> str:

@@ -41,6 +41,8 @@ SHAPE_METRICS: Final = {
 """Metrics of a reconstruction -> worst value, which an empty prediction is given. Metric units, squared or plain."""
 _Compared = tuple[dict[str, float | None], str | None, NDArray[np.float64] | None]
 """Metrics, why the reconstruction counts as empty (or None), and the distance of each true sample to it (None if empty)."""
+TOUCH_METRICS: Final = ("surface_iou", "touched_surface_recall")
+"""Metrics of what was touched. A reference without rollouts has none."""
 CALIBRATION_METRICS: Final = {"calibration_error": 1.0, "brier": 1.0}
 """Metrics of a volume's probability -> worst value, which a missing reconstruction is given. A mesh has none."""
 

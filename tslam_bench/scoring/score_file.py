@@ -1,24 +1,24 @@
-"""Scores of a submission, as they are stored: per object and seed, and aggregated (protocol section 10)."""
+"""Scores of a submission: per object and seed, and aggregated (protocol section 10)."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import PROTOCOL_VERSION
-from tslam_bench.errors import InvalidInputError
-from tslam_bench.scoring.aggregate import Estimate
-from tslam_bench.scoring.info import SubmissionInfo, parse_info
+from tslam_bench.scoring.aggregate import Estimate, estimate_all
+from tslam_bench.scoring.info import SubmissionInfo
 from tslam_bench.version import __version__
 
 SCORE_VERSION: Final = 2
 """Version of the score file's layout."""
+COUNTS: Final = ("1", "2", "4", "8")
+"""Numbers of poses that are scored."""
 CURVE_SPACING: Final = 10
 """Control steps between the stored samples of an exploration curve."""
 
@@ -65,6 +65,7 @@ class SubmissionScore:
             without the metrics that some result lacks.
         notes: one line each: what a reader of the figures should know.
         verified: whether its rollouts were replayed and reproduced.
+        made_here: whether these figures were computed by this user on this machine, and not by whoever sent them.
     """
 
     info: SubmissionInfo
@@ -75,6 +76,7 @@ class SubmissionScore:
     aggregate: dict[str, dict[str, Estimate]]
     notes: tuple[str, ...]
     verified: bool = False
+    made_here: bool = True
 
     def matrix(self, group: str, metric: str) -> NDArray[np.float64]:
         """Values of one metric: (objects, seeds). ``group`` is a key of ``aggregate``."""
@@ -100,33 +102,18 @@ class SubmissionScore:
             "notes": list(self.notes),
         }
 
-    @staticmethod
-    def from_json(value: Any, where: str) -> SubmissionScore:
-        """Reads a score file's content. Raises InvalidInputError if it is not one of this version."""
-        try:
-            if value["score_version"] != SCORE_VERSION or value["protocol_version"] != PROTOCOL_VERSION:
-                raise InvalidInputError(f"{where}: score file of another version; score the submission again")
-            return SubmissionScore(
-                info=parse_info(json.dumps(value["submission"]).encode()),
-                content_hash=str(value["content_hash"]),
-                objects=tuple(value["objects"]),
-                asset_sha256=str(value["asset_sha256"]),
-                results=tuple(ObjectScore(**result) for result in value["results"]),
-                aggregate={
-                    group: {name: Estimate(**estimate) for name, estimate in estimates.items()}
-                    for group, estimates in value["aggregate"].items()
-                },
-                notes=tuple(value["notes"]),
-                verified=bool(value["verified"]),
-            )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InvalidInputError(f"{where}: not a score file ({error}); score the submission again") from error
 
-
-def is_score_file(path: Path) -> bool:
-    """Whether a file is, or was meant as, a score file of any version."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(value, dict) and "score_version" in value
+def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:
+    """Estimates over objects and seeds of results in the order object by object, seed by seed."""
+    rows = {
+        "areas": [result.areas for result in results],
+        **{count: [result.poses[count] for result in results] for count in COUNTS},
+    }
+    groups: dict[str, dict[str, NDArray]] = {}
+    for group, values in rows.items():
+        groups[group] = {
+            name: np.array([row[name] for row in values], dtype=np.float64).reshape(objects, -1)
+            for name in values[0]
+            if all(row[name] is not None for row in values)
+        }
+    return {group: estimate_all(values) for group, values in groups.items()}

@@ -12,17 +12,13 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tslam_bench.errors import AssetError
 from tslam_bench.objects.splits import object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.aggregate import Estimate, estimate_all
 from tslam_bench.scoring.flags import copy_flags, unfelt_flags
 from tslam_bench.scoring.measure import load_truth, score_seeds
-from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
-from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, Submission, read_submission
+from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore, aggregate
+from tslam_bench.scoring.submission import Submission, read_submission
 from tslam_bench.scoring.verification import VerificationRecord, find_record
 
 FULL_ENTRY_SEEDS: Final = 3
@@ -101,22 +97,6 @@ def _score_part(
     part: Submission, name: str, record: VerificationRecord | None, cache: Path | None
 ) -> list[tuple[ObjectScore, float | None]]:
     return score_seeds(part, load_truth(name, cache), record)
-
-
-def aggregate(results: Sequence[ObjectScore], objects: int) -> dict[str, dict[str, Estimate]]:
-    """Estimates over objects and seeds of results in the order object by object, seed by seed."""
-    rows = {
-        "areas": [result.areas for result in results],
-        **{str(count): [result.poses[str(count)] for result in results] for count in RECONSTRUCTED_POSES},
-    }
-    groups: dict[str, dict[str, NDArray]] = {}
-    for group, values in rows.items():
-        groups[group] = {
-            name: np.array([row[name] for row in values], dtype=np.float64).reshape(objects, -1)
-            for name in values[0]
-            if all(row[name] is not None for row in values)
-        }
-    return {group: estimate_all(values) for group, values in groups.items()}
 
 
 def _notes(

@@ -8,34 +8,30 @@ records that were made here from those that somebody sent along.
 from __future__ import annotations
 
 import base64
-import contextlib
 import dataclasses
-import hmac
 import json
-import os
-import secrets
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE, HORIZON, PROTOCOL_VERSION
 from tslam_bench.episodes import Episode
-from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import cache_directory, ensure_writable_directory, write_json
+from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import write_json
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.rollout import Rollout
+from tslam_bench.scoring.seal import seal, sealed_here
 from tslam_bench.scoring.submission import Submission
 
 RECORD_VERSION: Final = 1
 """Version of a record's layout."""
 MAX_RECORD_SIZE: Final = 64 * 2**20
 """Bytes of a record."""
-KEY_FILE: Final = "verification.key"
 SUFFIX: Final = ".verification.json"
 Mode = Literal["bits", "segments"]
 _VOXELS: Final = GRID_SIZE**3
@@ -163,7 +159,7 @@ class VerificationRecord:
     def write(self, path: Path) -> None:
         """Writes the record with its seal. Raises AssetError if the file or the key cannot be written."""
         content = {"record_version": RECORD_VERSION, "protocol_version": PROTOCOL_VERSION, **dataclasses.asdict(self)}
-        write_json(path, {**content, "seal": _seal(content, _made_key())})
+        write_json(path, {**content, "seal": seal(content)})
 
     @staticmethod
     def read(path: Path) -> VerificationRecord:
@@ -177,11 +173,10 @@ class VerificationRecord:
             if path.stat().st_size > MAX_RECORD_SIZE:
                 raise InvalidInputError(f"{path}: more than {MAX_RECORD_SIZE} bytes; {remedy}")
             content = json.loads(path.read_text(encoding="utf-8"))
-            seal = content.pop("seal")
+            claimed = content.pop("seal")
             if content["record_version"] != RECORD_VERSION or content["protocol_version"] != PROTOCOL_VERSION:
                 raise InvalidInputError(f"{path}: a verification record of another version; {remedy}")
-            key = _key()
-            if key is None or not hmac.compare_digest(str(seal), _seal(content, key)):
+            if not sealed_here(content, claimed):
                 raise InvalidInputError(f"{path}: not made here, or changed since; {remedy}")
             fields = {k: v for k, v in content.items() if k not in ("record_version", "protocol_version", "verdicts")}
             return VerificationRecord(**fields, verdicts=tuple(Verdict(**v) for v in content["verdicts"]))
@@ -237,30 +232,3 @@ def unpack_steps(text: str) -> NDArray[np.int16]:
     flat = np.full(_VOXELS, -1, dtype=np.int16)
     flat[voxels] = steps
     return flat.reshape((GRID_SIZE,) * 3)
-
-
-def _seal(content: Mapping[str, Any], key: bytes) -> str:
-    return hmac.new(key, json.dumps(content, sort_keys=True).encode(), "sha256").hexdigest()
-
-
-def _key() -> bytes | None:
-    """The key of this user's records, or None if none was made here yet."""
-    path = cache_directory() / KEY_FILE
-    try:
-        return path.read_bytes() if path.is_file() else None
-    except OSError as error:
-        raise AssetError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-
-
-def _made_key() -> bytes:
-    """The key of this user's records; it is drawn if there is none."""
-    path = ensure_writable_directory(cache_directory()) / KEY_FILE
-    try:
-        with (
-            contextlib.suppress(FileExistsError),
-            os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream,
-        ):
-            stream.write(secrets.token_bytes(32))
-        return path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"{path}: cannot be read or written ({error.strerror}); check its permissions") from error

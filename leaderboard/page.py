@@ -30,6 +30,8 @@ Images = Mapping[tuple[str, str, str], bytes]
 
 OPEN_OBJECTS: Final = 2
 """Objects of the gallery that are unfolded when the page opens."""
+MOST_AUTHORS: Final = 4
+"""Authors of an entry that are named."""
 COUNTS: Final = tuple(RECONSTRUCTED_POSES)
 """Numbers of poses that are reported."""
 
@@ -78,14 +80,17 @@ def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
 
 
 def group_explorers(entries: Sequence[dict[str, Any]]) -> list[Explorer]:
-    """Explorers in the order of their best entry; entries of one explorer name and one exploration curve belong together."""
-    explorers: dict[tuple[str, tuple[float, ...]], Explorer] = {}
+    """Explorers in the order of their best entry; entries of one explorer name and one exploration curve belong together.
+
+    One that only claims the name of a baseline is another, whatever its curve.
+    """
+    explorers: dict[tuple[str, bool, tuple[float, ...]], Explorer] = {}
     for entry in entries:
         name = entry["submission"]["explorer"]
-        key = (name, tuple(entry["recall_curve"]))
+        key = (name, entry["claimed"], tuple(entry["recall_curve"]))
         if key not in explorers:
-            taken = any(known == name for known, _ in explorers)
-            label = f"{name} ({entry['submission']['method']})" if taken else name
+            taken = any(known == name and not claimed for known, claimed, _ in explorers)
+            label = f"{name} ({entry['submission']['method']})" if taken or entry["claimed"] else name
             explorers[key] = Explorer(label, entry["submission"]["privileged"])
         explorers[key].entries.append(entry)
     found = list(explorers.values())
@@ -115,6 +120,10 @@ def _page_template() -> jinja2.Template:
         "listed": lambda values: f"{', '.join(map(str, values[:-1]))} and {values[-1]}",
         "data_uri": lambda image: f"data:image/webp;base64,{base64.b64encode(image).decode('ascii')}",
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii"),
+        "people": lambda names: (
+            ", ".join(names[:MOST_AUTHORS])
+            + (f" and {len(names) - MOST_AUTHORS} more" if len(names) > MOST_AUTHORS else "")
+        ),
         "web_address": lambda link: link if re.match("https?://", link) else "",
     }
     return environment.get_template("page.html.jinja")

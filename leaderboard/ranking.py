@@ -15,16 +15,19 @@ from typing import Any, Final
 import numpy as np
 
 from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
+from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.objects.splits import object_set
 from tslam_bench.scoring.aggregate import interval, probability_of_improvement, resampled_means
 from tslam_bench.scoring.score_file import CURVE_SPACING, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.version import __version__
 
-LEADERBOARD_VERSION: Final = 2
+LEADERBOARD_VERSION: Final = 3
 """Version of the layout of leaderboard.json."""
 REFERENCE_EXPLORER: Final = "heuristic"
 """Explorer over which the probability of improvement is given."""
+RESERVED: Final = frozenset(spec.id for spec in list_baselines() if spec.kind != "own")
+"""Ids of the benchmark's own explorers."""
 
 
 def rank(scores: Sequence[SubmissionScore]) -> dict[str, Any]:
@@ -122,6 +125,7 @@ def _entry(
     written = score.to_json()
     return {
         **{name: written[name] for name in ("submission", "content_hash", "verified", "aggregate", "notes")},
+        "claimed": _claimed(score),
         "rank": position,
         "behind_leader": difference,
         "improvement": _improvement(score, group),
@@ -137,14 +141,21 @@ def _entry(
     }
 
 
+def _claimed(score: SubmissionScore) -> bool:
+    """Whether an entry calls itself by the id of a registered policy, which nothing here bears out."""
+    return score.info.explorer in RESERVED and not score.own_run
+
+
 def _improvement(score: SubmissionScore, group: Sequence[SubmissionScore]) -> float | None:
     """Probability of improvement in IoU area over the reference explorer with the same reconstructor, or None."""
-    if score.info.explorer == REFERENCE_EXPLORER:
-        return None
     same = [
-        s for s in group if s.info.explorer == REFERENCE_EXPLORER and s.info.reconstructor == score.info.reconstructor
+        other
+        for other in group
+        if other.info.explorer == REFERENCE_EXPLORER
+        and other.info.reconstructor == score.info.reconstructor
+        and not _claimed(other)
     ]
-    if not same:
+    if not same or score in same:
         return None
     reference = min(same, key=_sort_key)
     return probability_of_improvement(_area_matrix(score), _area_matrix(reference))

@@ -33,6 +33,7 @@ from tslam_bench.evaluation.policy import Policy
 from tslam_bench.evaluation.rollouts import roll_out_batch
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.grids import voxel_centres, world_to_object
+from tslam_bench.scoring.origin import has_origin
 from tslam_bench.scoring.rollout import Rollout, rollout_file
 from tslam_bench.scoring.submission import read_submission
 
@@ -308,6 +309,7 @@ def test_submissions_are_readable_and_resumed(tmp_path: Path) -> None:
     assert [path.name for path in submissions] == ["heuristic-grid", "heuristic-hull"]
 
     grid, hull = (read_submission(path) for path in submissions)
+    assert has_origin(grid) and has_origin(hull), "heuristic is what it calls itself"
     source = json.loads((folder / "source.json").read_text())
     assert grid.info.policy_salt == source["policy_salt"] and grid.info.control_mode == "pd_joint_delta_pos"
     assert grid.info.label == "a label" and grid.info.explorer == "heuristic" and not grid.info.privileged

@@ -23,6 +23,7 @@ from tslam_bench.leaderboard.commands import find_inputs, page_main
 from tslam_bench.leaderboard.page import build_page
 from tslam_bench.leaderboard.ranking import rank
 from tslam_bench.objects.store import asset_sha256
+from tslam_bench.scoring.origin import beside, has_origin, write_origin
 from tslam_bench.scoring.submission import read_submission
 from tslam_bench.scoring.verification import Verdict, VerificationRecord, pack_steps, record_path
 
@@ -250,6 +251,48 @@ def test_a_page_destroys_no_submission_and_no_other_page(run: Path, tmp_path: Pa
             page_main([str(run / "scores"), "--output", str(output)])
     assert sorted(path.name for path in submission.iterdir()) == before
     assert (tmp_path / "index.html").read_text() == "my home page"
+
+
+def test_the_page_says_whose_each_entry_is_and_what_is_only_claimed(page: Path, run: Path, tmp_path: Path) -> None:
+    entries = json.loads((page / "leaderboard.json").read_text())["tables"][0]["entries"]
+    text = (page / "index.html").read_text(encoding="utf-8")
+    assert text.count("<small>A. Author</small>") == len(entries) == 4
+    claimed = {entry["submission"]["explorer"] for entry in entries if entry["claimed"]}
+    assert claimed == {"heuristic", "random", "tslam_chamfer"} and text.count(">claimed</span>") == 3
+    assert all(entry["improvement"] is None for entry in entries)
+
+    submission = read_submission(shutil.copytree(run / "submissions/heuristic-hull", tmp_path / "heuristic-hull"))
+    assert not has_origin(submission)
+    write_origin(submission)  # as evaluate does
+    assert has_origin(submission)
+    shutil.copytree(run / "submissions/mine-hull", tmp_path / "mine-hull")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tslam_bench.objects.splits.QUICK_OBJECTS", NAMES)
+        page_main([str(tmp_path), "--output", str(tmp_path / "page"), "--pictured", "0"])
+    found = {
+        entry["submission"]["explorer"]: (entry["claimed"], entry["improvement"])
+        for entry in json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]
+    }
+    assert found["heuristic"] == (False, None) and found["mine"][0] is False and found["mine"][1] is not None
+
+    # Beside other files, or with another seal, the note says nothing.
+    other = read_submission(run / "submissions/random-grid")
+    note = beside(submission.location, ".origin.json")
+    shutil.copytree(run / "submissions/random-grid", tmp_path / "copy" / "random-grid")
+    copied = read_submission(tmp_path / "copy" / "random-grid")
+    shutil.copy(note, beside(copied.location, ".origin.json"))
+    assert other.content_hash == copied.content_hash and not has_origin(copied)
+    sealed = json.loads(note.read_text())
+    for change in ({"seal": "0" * 64}, {"seal": None}, {"explorer": "random"}, {"more": 1}):
+        note.write_text(json.dumps(sealed | change))
+        assert not has_origin(submission)
+    note.write_text("[" * 1000)
+    assert not has_origin(submission)
+
+
+def test_many_authors_are_counted() -> None:
+    board = rank([fake_score("a", [0.2], authors=tuple(f"Author {k}" for k in range(100)))])
+    assert "Author 0, Author 1, Author 2, Author 3 and 96 more<" in build_page(board, {})
 
 
 def forged(run: Path, name: str) -> dict:

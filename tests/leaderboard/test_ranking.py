@@ -111,6 +111,37 @@ def test_improvement_is_over_the_heuristic_of_the_same_reconstructor() -> None:
     }
 
 
+def test_who_only_calls_themselves_a_baseline_is_nobody_s_yardstick() -> None:
+    scores = [
+        fake_score("heuristic", [0.01, 0.01], own_run=False),  # a stranger's, weak on purpose
+        fake_score("a", [0.3, 0.3]),
+        fake_score("random", [0.5, 0.5], own_run=False),
+        fake_score("mine", [0.3, 0.3], own_run=False),  # no id of the benchmark's: nothing to bear out
+    ]
+    entries = rank(scores)["tables"][0]["entries"]
+    assert all(entry["improvement"] is None for entry in entries)
+    assert {e["submission"]["explorer"] for e in entries if e["claimed"]} == {"heuristic", "random"}
+    honest = fake_score("heuristic", [0.4, 0.2])
+    for order in ([*scores, honest], [honest, *scores]):
+        found = {
+            (e["submission"]["explorer"], e["claimed"]): e["improvement"] for e in rank(order)["tables"][0]["entries"]
+        }
+        assert found == {
+            ("heuristic", False): None,
+            ("heuristic", True): 0.0,
+            ("a", False): 0.5,
+            ("random", True): 1.0,
+            ("mine", False): 0.5,
+        }
+
+
+def test_a_claimed_baseline_stands_apart_from_the_real_one() -> None:
+    """Even with the very curve of the real one, as who copies it would have."""
+    board = rank([fake_score("heuristic", [0.2]), fake_score("heuristic", [0.3], own_run=False, method="Copy")])
+    groups = group_explorers(board["tables"][0]["entries"])
+    assert sorted((g.label, len(g.entries)) for g in groups) == [("heuristic", 1), ("heuristic (Copy)", 1)]
+
+
 def test_explorers_are_grouped_by_their_rollouts() -> None:
     entries = rank([fake_score("a", [0.2], 0.1, 0.3), fake_score("a", [0.1], 0.1, 0.3, reconstructor="grid")])
     other = rank([fake_score("a", [0.2], 0.1, 0.4, method="Other")])

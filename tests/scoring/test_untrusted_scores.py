@@ -171,7 +171,7 @@ def test_what_lies_is_named(foreign: Any, path: tuple, new: Any, fragment: str) 
     refused(changed(foreign, path, new) if path != ("more",) else {**foreign, "more": 1}, fragment)
 
 
-@pytest.mark.parametrize("value", [None, [], {}, "text", 3, {"score_version": 2}])
+@pytest.mark.parametrize("value", [None, [], {}, "text", 3, {"score_version": 3}])
 def test_what_is_no_score_is_refused(value: Any) -> None:
     refused(value)
 

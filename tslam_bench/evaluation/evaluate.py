@@ -50,8 +50,9 @@ from tslam_bench.reconstruction.registry import (
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.registration import make_vec
 from tslam_bench.scoring.info import SubmissionInfo, Training
+from tslam_bench.scoring.origin import write_origin
 from tslam_bench.scoring.rollout import Rollout, rollout_file
-from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter, read_submission
 from tslam_bench.version import __version__
 
 SOURCE_FILE: Final = "source.json"
@@ -186,6 +187,7 @@ def evaluate(
             for done, (object_name, seed) in enumerate(_repetitions(config)):
                 _add_object(writer, spec, folder, reconstructor.made, object_name, seed)
                 report(f"reconstruct {name}", done + 1, total)
+        write_origin(read_submission(submission))
         submissions.append(submission)
     return submissions
 

@@ -15,7 +15,7 @@ from tslam_bench.scoring.aggregate import Estimate, estimate_all
 from tslam_bench.scoring.info import SubmissionInfo
 from tslam_bench.version import __version__
 
-SCORE_VERSION: Final = 2
+SCORE_VERSION: Final = 3
 """Version of the score file's layout."""
 COUNTS: Final = ("1", "2", "4", "8")
 """Numbers of poses that are scored."""
@@ -65,6 +65,7 @@ class SubmissionScore:
             without the metrics that some result lacks.
         notes: one line each: what a reader of the figures should know.
         verified: whether its rollouts were replayed and reproduced.
+        own_run: whether the explorer is what it calls itself: its rollouts were made by it on this machine.
         made_here: whether these figures were computed by this user on this machine, and not by whoever sent them.
     """
 
@@ -76,6 +77,7 @@ class SubmissionScore:
     aggregate: dict[str, dict[str, Estimate]]
     notes: tuple[str, ...]
     verified: bool = False
+    own_run: bool = False
     made_here: bool = True
 
     def matrix(self, group: str, metric: str) -> NDArray[np.float64]:
@@ -92,6 +94,7 @@ class SubmissionScore:
             "submission": self.info.to_json(),
             "content_hash": self.content_hash,
             "verified": self.verified,
+            "own_run": self.own_run,
             "objects": list(self.objects),
             "asset_sha256": self.asset_sha256,
             "results": [dataclasses.asdict(result) for result in self.results],

@@ -17,6 +17,7 @@ from tslam_bench.objects.splits import object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.flags import copy_flags, unfelt_flags
 from tslam_bench.scoring.measure import load_truth, score_seeds
+from tslam_bench.scoring.origin import has_origin
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore, aggregate
 from tslam_bench.scoring.submission import Submission, read_submission
 from tslam_bench.scoring.verification import VerificationRecord, find_record
@@ -90,6 +91,7 @@ def score_submission(
         aggregate=aggregate(results, len(names)),
         notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record), *flags),
         verified=record is not None,
+        own_run=has_origin(submission),
     )
 
 

@@ -131,6 +131,7 @@ def _score(value: Any) -> SubmissionScore:
         content,
         "the file",
         *("score_version", "protocol_version", "package_version", "submission", "content_hash", "verified"),
+        "own_run",
         *("objects", "asset_sha256", "results", "aggregate", "notes"),
     )
     _text(content["package_version"], "package_version", 100)
@@ -138,8 +139,9 @@ def _score(value: Any) -> SubmissionScore:
     for name in ("content_hash", "asset_sha256"):
         if not re.fullmatch(r"[0-9a-f]{64}", _text(content[name], name, 64)):
             raise _Wrong(f"{name} is no SHA-256")
-    if not isinstance(content["verified"], bool):
-        raise _Wrong("verified is neither true nor false")
+    for name in ("verified", "own_run"):
+        if not isinstance(content[name], bool):
+            raise _Wrong(f"{name} is neither true nor false")
     objects = tuple(_text(name, "objects", 80) for name in _list(content["objects"], "objects", len(OBJECTS)))
     if not objects or len(set(objects)) < len(objects) or not OBJECTS.keys() >= set(objects):
         raise _Wrong("objects are not different objects of the test split")
@@ -160,6 +162,7 @@ def _score(value: Any) -> SubmissionScore:
         aggregate=_estimates(content["aggregate"]) if made_here else aggregate(scores, len(objects)),
         notes=tuple(notes) if made_here else (NOT_MADE_HERE, *(note for note in notes if note != NOT_MADE_HERE)),
         verified=content["verified"] and made_here,
+        own_run=content["own_run"] and made_here,
         made_here=made_here,
     )
 

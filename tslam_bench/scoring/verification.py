@@ -24,6 +24,7 @@ from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import write_json
 from tslam_bench.objects.store import asset_sha256
+from tslam_bench.scoring.origin import beside
 from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.seal import seal, sealed_here
 from tslam_bench.scoring.submission import Submission
@@ -191,8 +192,7 @@ class VerificationRecord:
 
 def record_path(submission: Path | str) -> Path:
     """Where the record of a submission lies if nothing else was said: beside it, never inside."""
-    path = Path(submission).resolve()
-    return path.with_name(f"{path.stem if path.suffix == '.zip' else path.name}{SUFFIX}")
+    return beside(submission, SUFFIX)
 
 
 def find_record(

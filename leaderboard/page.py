@@ -1,7 +1,7 @@
 """The leaderboard as one static HTML page: no external request, no framework, readable without scripts.
 
 This module picks and groups what the page shows; ``templates/`` write it. Everything that a template prints is escaped
-(Jinja2 with autoescape), so nothing here needs to be.
+(Jinja2 with autoescape), and what is no text is made visible, so nothing here needs to be.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from tslam_bench import constants
 from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, interval, means, number
 from tslam_bench.scoring.info import OBJECT_SETS
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
+from tslam_bench.text import visible
 
 from .charts import Axis, Chart, Line, line_chart, line_style
 from .pictures import TOUCHED_AS_THEY_ARE
@@ -107,6 +108,7 @@ def _page_template() -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
+        finalize=lambda value: visible(value) if type(value) is str else value,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +139,44 @@ def test_names_are_not_read_as_markup(capsys: pytest.CaptureFixture[str]) -> Non
     for table in (summary_table([score]), object_table(score)):
         Console(width=200).print(table)
         assert "[red]mine[/] [/nothing]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "method", ["Ours [/w noise]", "[red]mine[/]", "a :smile: b", "back\\", "\\[x]", "a\u202eb", "力 Größe [/]", "]["]
+)
+def test_every_name_comes_through_the_tables_as_it_is(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    score = fake_score("a", [0.25])
+    score = replace(score, info=replace(score.info, method=method))
+    for table in (summary_table([score]), object_table(score)):
+        Console(width=200).print(table)
+        assert method.replace("\u202e", "\\u202e") in capsys.readouterr().out
+
+
+def test_a_terminal_without_unicode_gets_escapes(run: Path, tmp_path: Path, primitive_cache: Path) -> None:
+    """What takes minutes to compute is not lost for a letter."""
+    folder = tmp_path / "sub"
+    shutil.copytree(run / "submissions" / "random-grid", folder)
+    about = json.loads((folder / "submission.json").read_text()) | {"method": "Größe 力 [/w noise]"}
+    (folder / "submission.json").write_text(json.dumps(about))
+    for form in ([], ["--json"]):
+        code = f"from tslam_bench.cli import main; main({['score', str(folder), '--objects', 'mug', *form]!r})"
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii", "TSLAM_BENCH_CACHE": str(primitive_cache)}
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False)
+        assert done.returncode == 0 and done.stdout.isascii(), done.stderr.decode()
+        if form:
+            assert json.loads(done.stdout)["submission"]["method"] == "Größe 力 [/w noise]"
+        else:
+            assert rb"Gr\xf6\xdfe \u529b [/w noise]" in done.stdout
+
+
+def test_escape_characters_in_names_of_files_do_not_reach_the_terminal(run: Path, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "sub\x1b[31m"
+    shutil.copytree(run / "submissions" / "random-grid", folder)
+    (folder / "notes\x1b[2J\n.txt").write_text("x")
+    with pytest.raises(SystemExit):
+        main(["score", str(folder), "--objects", "mug"])
+    error = capsys.readouterr().err
+    assert "\x1b" not in error.replace("\x1b[A", "") and "notes\\x1b[2J\\n.txt: not a file of a submission" in error
 
 
 @pytest.mark.parametrize(

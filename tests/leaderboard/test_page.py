@@ -132,6 +132,11 @@ def test_no_text_of_a_submission_becomes_markup() -> None:
     assert names == 3 * [HOSTILE]  # what the browser reads is the text itself, no more and no less
 
 
+def test_text_that_turns_or_hides_its_surroundings_is_shown_as_an_escape() -> None:
+    text = page_with("a\u202eb\u200bc\x1bd", "")
+    assert not set("\u202e\u200b\x1b") & set(text) and r"a\u202eb\u200bc\x1bd" in text
+
+
 @pytest.mark.parametrize(
     "link", ["javascript:alert(1)", "data:text/html,x", " https://example.org", "//example.org", ""]
 )

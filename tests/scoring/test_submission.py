@@ -256,6 +256,14 @@ def test_a_rollout_is_copied_where_links_are_not_allowed(tmp_path: Path, monkeyp
         ({"method": ""}, ["method is empty"]),
         ({"method": 3}, ["method is 3", "text"]),
         ({"method": "two\nlines"}, ["one line"]),
+        ({"method": "clear\x1b[2J"}, ["one line"]),
+        ({"method": " \u3000"}, ["method is empty"]),
+        ({"authors": ["A", " "]}, ["one name is empty"]),
+        ({"training": {"steps": 10**400, "wall_time_hours": 1, "hardware": ""}}, ["training.steps is 1000"]),
+        (
+            {"training": {"steps": 4, "wall_time_hours": 10**400, "hardware": ""}},
+            ["wall_time_hours is 1000", "from 0 to"],
+        ),
         ({"method": "x" * 1000}, ["at most 300"]),
         ({"explorer": "My Method"}, ["explorer 'My Method'"]),
         ({"authors": []}, ["authors"]),
@@ -309,7 +317,12 @@ def test_missing_fields_are_refused(folder: Path, field: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 60_000, b'{"method": NaN}', b'{"a": 1' + b"0" * 5000 + b"}"]
+    "text",
+    [
+        b'{"method": "honest", "method": "other"}',
+        b'{"method": "half \\ud83d"}',
+        *[b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 60_000, b'{"method": NaN}', b'{"a": 1' + b"0" * 5000 + b"}"],
+    ],
 )
 def test_malformed_json_is_refused(folder: Path, text: bytes) -> None:
     (folder / "submission.json").write_bytes(text)
@@ -319,6 +332,18 @@ def test_malformed_json_is_refused(folder: Path, text: bytes) -> None:
 def test_large_json_is_refused(folder: Path) -> None:
     (folder / "submission.json").write_text(json.dumps(INFO.to_json()) + " " * 70_000)
     refused(folder, "more than 65536 bytes")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["Größe 力 [/w noise]", "می\u200cخواهم", "東京\u3000大学", "👩\u200d🔬", "a\u202eb", "<b>", "{{ x }}", "\\"],  # noqa: RUF001
+)
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_text_of_every_script_is_read(folder: Path, text: str, mark: bytes) -> None:
+    info = replace(INFO, method=text, authors=(text,), label=text, contact=text)
+    for ascii_only in (True, False):
+        (folder / "submission.json").write_bytes(mark + json.dumps(info.to_json(), ensure_ascii=ascii_only).encode())
+        assert read_submission(folder).info == info
 
 
 def test_privileged_declared_is_accepted(folder: Path) -> None:
@@ -650,7 +675,6 @@ def test_links_and_special_files_in_a_folder_are_refused(folder: Path, tmp_path:
         "rollouts//x.npz",
         "C:/evil.npz",
         "a/./b.npz",
-        "a\x07b",
     ],
 )
 def test_entries_that_escape_are_refused(folder: Path, name: str) -> None:

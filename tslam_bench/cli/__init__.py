@@ -32,6 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         print(__version__)
         return
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # what a terminal's encoding lacks is an escape, no traceback
     with one_line_errors("tslam-bench"):
         about = "A benchmark for tactile exploration and reconstruction."
         summaries = {name: summary for name, (_, _, summary) in _COMMANDS.items()}

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from tslam_bench.cli.commands import run_command
 from tslam_bench.cli.progress import Progress
+from tslam_bench.cli.terminal import cell
 from tslam_bench.constants import DEFAULT_SPLIT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import atomic_file, cache_directory, write_json
@@ -312,9 +313,9 @@ def _list(command: List) -> None:
     for record in records:
         gates = record["gates"]
         table.add_row(
-            record["name"],
-            record["category"],
-            ", ".join(record["aliases"]),
+            cell(record["name"]),
+            cell(record["category"]),
+            cell(", ".join(record["aliases"])),
             " x ".join(f"{100 * x:.1f}" for x in record["extents_m"]),
             f"{1e6 * record['volume_m3']:.0f}",
             str(record["hull_count"]),

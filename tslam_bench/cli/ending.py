@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tslam_bench.errors import BenchmarkError, UserCodeError
 from tslam_bench.extras import named_extra
+from tslam_bench.text import visible
 
 _PACKAGE = str(Path(__file__).parents[1])
 
@@ -26,10 +27,10 @@ def one_line_errors(program: str) -> Iterator[None]:
         sys.stdout.flush()  # here, where what goes wrong is one line
     except UserCodeError as error:
         _print_cause(error)
-        print(f"{program}: {error}", file=sys.stderr)
+        print(visible(f"{program}: {error}"), file=sys.stderr)
         sys.exit(1)
     except BenchmarkError as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        print(visible(f"{program}: {error}"), file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print(f"{program}: interrupted; run the same command again to go on", file=sys.stderr)
@@ -41,7 +42,7 @@ def one_line_errors(program: str) -> Iterator[None]:
         if error.filename is None:  # writing to standard output
             _drop_output()
         where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-        print(f"{program}: {where}{error.strerror or error}", file=sys.stderr)
+        print(visible(f"{program}: {where}{error.strerror or error}"), file=sys.stderr)
         sys.exit(2)
 
 

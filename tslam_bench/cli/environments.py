@@ -189,4 +189,4 @@ def _video(command: Video) -> None:
     milliseconds = round(1000 * CONTROL_STEP_SECONDS * command.every)
     with atomic_file(command.output) as temporary:
         frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
-    Console().print(f"{command.output}: {len(frames)} frames")
+    print(f"{command.output}: {len(frames)} frames")

@@ -8,6 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tslam_bench.text import visible
+
 
 class Progress:
     """A bar that is set rather than advanced; use it as a context.
@@ -21,7 +23,7 @@ class Progress:
 
     def __init__(self, description: str, unit: str = "it", total: int | None = None, **options: Any) -> None:
         settings = {"file": sys.stderr, "mininterval": 0.5, "miniters": 0, "dynamic_ncols": True, **options}
-        self._bar = tqdm(desc=description, unit=unit, total=total, **settings)
+        self._bar = tqdm(desc=visible(description), unit=unit, total=total, **settings)
 
     def show(self, done: int, total: int | None = None, note: str = "") -> None:
         """Sets how much is done, and of how much; ``note`` stands behind the bar."""

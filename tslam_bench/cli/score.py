@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import tyro
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from tslam_bench.cli.progress import Progress
+from tslam_bench.cli.terminal import cell
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import check_output
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
@@ -75,7 +75,7 @@ def score_main(arguments: Sequence[str]) -> None:
         if len(scores) == 1:
             console.print(object_table(score))
         for note in score.notes:
-            console.print(f"[yellow]note[/] {escape(f'{score.info.method}: {note}')}", highlight=False)
+            console.print(cell("note", "yellow"), cell(f"{score.info.method}: {note}"))
 
 
 def _with_records(
@@ -110,7 +110,7 @@ def summary_table(scores: Sequence[SubmissionScore]) -> Table:
         aggregate: dict[str, Any] = score.to_json()["aggregate"]
         values = means(aggregate)
         table.add_row(
-            escape(score.info.method + (" (privileged)" if score.info.privileged else "")),
+            cell(score.info.method + (" (privileged)" if score.info.privileged else "")),
             IOU_AREA.text(values),
             interval(aggregate["areas"]["iou_area"]),
             *(figure.text(values) for figure in FIGURES),
@@ -120,7 +120,7 @@ def summary_table(scores: Sequence[SubmissionScore]) -> Table:
 
 def object_table(score: SubmissionScore) -> Table:
     """One row per object and seed of one submission."""
-    table = _table(f"{escape(score.info.method)}, per object; all that names no number is after 8 poses")
+    table = _table(f"{score.info.method}, per object; all that names no number is after 8 poses")
     table.add_column("object")
     _add_columns(table, "seed", IOU_AREA.short, *(figure.short for figure in FIGURES))
     table.add_column("remark")
@@ -131,13 +131,13 @@ def object_table(score: SubmissionScore) -> Table:
             str(result.seed),
             IOU_AREA.text(values),
             *(figure.text(values) for figure in FIGURES),
-            escape(_remark(result)),
+            cell(_remark(result)),
         )
     return table
 
 
 def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    return Table(title=cell(title, "italic"), title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
 
 
 def _add_columns(table: Table, *names: str) -> None:

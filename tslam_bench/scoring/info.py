@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 import re
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
@@ -20,6 +19,7 @@ from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.plugins import IDENTIFIER
 from tslam_bench.scoring.untrusted_json import parse_json
+from tslam_bench.text import CONTROL
 
 SCHEMA_VERSION: Final = 2
 """Version of the submission format. 2: rollouts hold joint checkpoints."""
@@ -32,6 +32,7 @@ _STATED = ("schema_version", "protocol_version", "environment_id", "control_mode
 """Fields that have a default for who writes a submission; a file has to state them."""
 _MAX_TEXT = 300
 _MAX_SEED = 2**31 - 1
+_MAX_HOURS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class SubmissionInfo:
             if getattr(self, name) != own:
                 raise InvalidInputError(f"{name} is {getattr(self, name)!r}, the scorer's is {own!r}; {remedy}")
         for name in ("method", "package_version"):
-            if not _text(getattr(self, name), name):
+            if not _text(getattr(self, name), name).strip():
                 raise InvalidInputError(f"{name} is empty; fill it in")
         for name in ("label", "contact", "link"):
             _text(getattr(self, name), name)
@@ -121,7 +122,7 @@ class SubmissionInfo:
         if not isinstance(self.authors, tuple) or not 1 <= len(self.authors) <= 100:
             raise InvalidInputError("authors: expected a list of 1 to 100 names")
         for author in self.authors:
-            if not _text(author, "authors"):
+            if not _text(author, "authors").strip():
                 raise InvalidInputError("authors: one name is empty; fill it in")
         if not isinstance(self.seeds, tuple) or not 1 <= len(self.seeds) <= 100:
             raise InvalidInputError("seeds: expected a list of 1 to 100 integers")
@@ -145,8 +146,10 @@ class SubmissionInfo:
             raise InvalidInputError("training: expected an object with steps, wall_time_hours and hardware")
         _integer(self.training.steps, "training.steps", 0)
         hours = self.training.wall_time_hours
-        if isinstance(hours, bool) or not isinstance(hours, int | float) or not 0 <= hours < math.inf:
-            raise InvalidInputError(f"training.wall_time_hours is {hours!r}; expected a number of hours, 0 or more")
+        if isinstance(hours, bool) or not isinstance(hours, int | float) or not 0 <= hours <= _MAX_HOURS:
+            raise InvalidInputError(
+                f"training.wall_time_hours is {_shown(hours)}; expected a number of hours from 0 to {_MAX_HOURS:,}"
+            )
         _text(self.training.hardware, "training.hardware")
         if not self.privileged and (
             self.reward_mode in PRIVILEGED_REWARD_MODES or self.explorer in PRIVILEGED_EXPLORERS
@@ -213,8 +216,8 @@ def _build(kind: type, values: Any, prefix: str) -> Any:
 def _text(value: Any, name: str) -> str:
     if not isinstance(value, str):
         raise InvalidInputError(f"{name} is {_shown(value)}; expected text")
-    if len(value) > _MAX_TEXT or not value.isprintable():
-        raise InvalidInputError(f"{name}: expected at most {_MAX_TEXT} printable characters on one line")
+    if len(value) > _MAX_TEXT or CONTROL.search(value):
+        raise InvalidInputError(f"{name}: expected at most {_MAX_TEXT} characters on one line")
     return value
 
 

@@ -33,6 +33,7 @@ from tslam_bench.scoring.rollout import OBJECT_NAME, Rollout, parse_rollout_file
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 from tslam_bench.scoring.untrusted_files import FileSource, open_source
 from tslam_bench.scoring.untrusted_mesh import MAX_MESH_ELEMENTS, read_ply
+from tslam_bench.text import visible
 
 INFO_FILE: Final = "submission.json"
 ROLLOUTS: Final = "rollouts/"
@@ -159,7 +160,7 @@ def _check_names(source: FileSource, info: SubmissionInfo, objects: Collection[s
     for name in sorted(source.sizes):
         if name == INFO_FILE:
             continue
-        where = f"{source.location}: {name[:100]}"
+        where = f"{source.location}: {visible(name)[:100]}"
         episode, match = _episode(name), _RECONSTRUCTION_NAME.fullmatch(name)
         if episode is not None:
             object_name, seed = episode[0], episode[2]

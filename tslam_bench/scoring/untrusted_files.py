@@ -186,7 +186,6 @@ def _check_entry(location: str, entry: zipfile.ZipInfo) -> None:
         any(part in ("", ".", "..") for part in parts)
         or "\\" in entry.filename
         or ":" in entry.filename
-        or not entry.filename.isprintable()
         or "\0" in entry.orig_filename
     ):
         raise InvalidInputError(f"{location}: the entry {name} leaves the archive; pack it again with relative names")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import os
 import pickle
+import shutil
 import stat
 import tracemalloc
 import zipfile
@@ -672,9 +674,12 @@ def test_links_and_special_files_in_a_folder_are_refused(folder: Path, tmp_path:
         "../evil.npz",
         "/etc/evil.npz",
         "rollouts/../../evil.npz",
-        "rollouts//x.npz",
+        "rollouts/./../../x.npz",
+        "..\\evil.npz",
+        "rollouts\\..\\..\\x.npz",
+        "\\evil.npz",
         "C:/evil.npz",
-        "a/./b.npz",
+        "C:evil.npz",
     ],
 )
 def test_entries_that_escape_are_refused(folder: Path, name: str) -> None:
@@ -700,11 +705,120 @@ def test_doubled_entries_are_refused(folder: Path) -> None:
     refused(path, "twice")
 
 
-def test_zip_bombs_are_refused(folder: Path) -> None:
+def test_an_archive_of_mostly_empty_volumes_is_no_bomb(folder: Path) -> None:
+    """Stored without compression, as numpy.savez does; the archive makes 32 MiB of 40 kB. A folder of it is read, too."""
+    probability = np.zeros((256, 256, 256), np.float16)
+    probability[100:140, 100:140, 100:140] = 1
+    np.savez(folder / VOLUME, probability=probability, interpolation=np.array("linear"))
     path = zipped(folder)
-    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("rollouts/mug/pose0_seed0.npz", b"\0" * (20 * 2**20))
-    refused(path, "unpacks to more than 100 times its size")
+    assert path.stat().st_size < (folder / VOLUME).stat().st_size / 100
+    assert read_submission(path).content_hash == read_submission(folder).content_hash
+
+
+def test_what_unpacks_to_more_than_the_limits_is_refused_before_it_is_unpacked(folder: Path) -> None:
+    """Declared sizes are counted, and nothing is unpacked beyond what is declared."""
+    path = zipped(folder)
+    with (
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        archive.open("rollouts/mug/pose0_seed0.npz", "w") as stream,
+    ):
+        for _ in range(65):
+            stream.write(bytes(2**20))
+    assert peak_of_reading(path, "at most 67108864 are read") < 20e6
+    # The same with a lie in the list of entries: reading stops at the declared size.
+    data = path.read_bytes()
+    for size in (65 * 2**20, 1000):
+        data = data.replace((65 * 2**20).to_bytes(4, "little"), size.to_bytes(4, "little"))
+    path.write_bytes(data)
+    assert peak_of_reading(path, "pose0_seed0.npz") < 20e6
+
+
+def test_entries_that_share_their_bytes_count_each(folder: Path) -> None:
+    """A thousand entries that all point to one of 60 MiB: 60 GB from 60 kB."""
+    path = folder.parent / "sub.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x", bytes(60 * 2**20))
+        entry = archive.filelist[0]
+        for number in range(1000):
+            other = copy.copy(entry)
+            other.filename = f"rollouts/mug/pose0_seed{number}.npz"
+            archive.filelist.append(other)
+    assert path.stat().st_size < 300_000
+    assert peak_of_reading(path, "bytes uncompressed; at most 8589934592 are read") < 20e6
+
+
+@pytest.mark.parametrize("style", ["backslashes", "dots", "backslashes and dots", "doubled slashes"])
+def test_archives_as_other_systems_pack_them_are_read(folder: Path, style: str) -> None:
+    path = folder.parent / "sub.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(folder.rglob("*")):
+            name = file.relative_to(folder.parent).as_posix()
+            name = f"./{name}" if "dots" in style else name
+            name = name.replace("/", "\\") if "backslashes" in style else name
+            name = name.replace("/", "//") if style == "doubled slashes" else name
+            if file.is_dir():
+                archive.writestr(zipfile.ZipInfo(name + ("\\" if "backslashes" in style else "/")), b"")
+            else:
+                archive.writestr(zipfile.ZipInfo(name), file.read_bytes())
+    submission = read_submission(path)
+    assert submission.content_hash == read_submission(folder).content_hash
+    submission = pickle.loads(pickle.dumps(submission.of_object("mug")))
+    assert submission.rollout("mug", 3, 7) is not None
+
+
+LITTER = [
+    *("desktop.ini", "Desktop.ini", "Thumbs.db", "Icon\r", "Icon", ".DS_Store", "._submission.json"),
+    *(
+        "rollouts/desktop.ini",
+        "rollouts/mug/Thumbs.db",
+        "__MACOSX/._x",
+        "@eaDir/x",
+        "$RECYCLE.BIN/y",
+        ".git/objects/pack",
+    ),
+    *("README.md", "LICENSE", "readme"),
+]
+
+
+@pytest.mark.parametrize("name", LITTER)
+def test_what_file_managers_leave_is_no_part_of_a_submission(folder: Path, name: str) -> None:
+    before = read_submission(folder).content_hash
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(b"x")
+    assert read_submission(folder).content_hash == before
+    assert read_submission(zipped(folder)).content_hash == before
+    assert read_submission(zipped(folder, "sub/")).content_hash == before
+    path = zipped(folder, "sub/")
+    with zipfile.ZipFile(path, "a") as archive:  # beside the one folder
+        archive.writestr(name, b"x")
+    assert read_submission(path).content_hash == before
+
+
+def test_litter_may_be_large_and_may_be_links(folder: Path, monkeypatch) -> None:
+    before = read_submission(folder).content_hash
+    (folder / ".git").mkdir()
+    (folder / ".git" / "pack").write_bytes(bytes(300_000))
+    (folder / ".git" / "HEAD").symlink_to("pack")
+    os.mkfifo(folder / ".pipe")
+    monkeypatch.setattr(untrusted_files, "MAX_FILE_SIZE", 200_000)
+    assert read_submission(folder).content_hash == before
+
+
+def test_a_submission_in_the_wrong_place_is_found(folder: Path, tmp_path: Path) -> None:
+    outer = tmp_path / "outer"
+    shutil.copytree(folder, outer / "deep" / "one")
+    refused(outer, "submission.json is missing; it is in the folder deep/one")
+    with zipfile.ZipFile(tmp_path / "deep.zip", "w") as archive:
+        for file in sorted((outer / "deep").rglob("*")):
+            archive.write(
+                file, "a/b/" + file.relative_to(outer / "deep" / "one").as_posix()
+            ) if file.is_file() else None
+    refused(tmp_path / "deep.zip", "it is in the folder a/b, so give (or pack) that folder alone")
+    shutil.copytree(folder, outer / "deep" / "two")
+    refused(outer, "deep/one and deep/two hold one each")
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w"):
+        pass
+    refused(tmp_path / "empty.zip", "submission.json is missing")
 
 
 def test_limits_on_files_and_sizes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,9 +131,7 @@ def read_submission(path: Path | str, objects: Collection[str] | None = None) ->
     """
     source = open_source(Path(path))
     if INFO_FILE not in source.sizes:
-        raise InvalidInputError(
-            f"{source.location}: {INFO_FILE} is missing; an unfinished run writes it last, so resume it"
-        )
+        raise InvalidInputError(f"{source.location}: {INFO_FILE} is missing; {_where_else(source)}")
     if source.sizes[INFO_FILE] > MAX_INFO_SIZE:
         raise InvalidInputError(f"{source.location}: {INFO_FILE} has more than {MAX_INFO_SIZE} bytes; shorten it")
     data = source.read(INFO_FILE)
@@ -152,6 +150,17 @@ def read_submission(path: Path | str, objects: Collection[str] | None = None) ->
             else:
                 _reconstruction(data, name, source.location)
     return Submission(source, info, digests, _combined(digests))
+
+
+def _where_else(source: FileSource) -> str:
+    """What to do about a submission without a submission.json."""
+    found = sorted(name for name in source.sizes if name.endswith(f"/{INFO_FILE}"))
+    if len(found) > 1:
+        folders = " and ".join(visible(name.rpartition("/")[0])[:60] for name in found[:2])
+        return f"{folders} hold one each, so give them one by one"
+    if found:
+        return f"it is in the folder {visible(found[0].rpartition('/')[0])[:100]}, so give (or pack) that folder alone"
+    return "an unfinished run writes it last, so resume it"
 
 
 def _check_names(source: FileSource, info: SubmissionInfo, objects: Collection[str]) -> None:

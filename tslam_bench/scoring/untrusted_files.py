@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import kind_of_file
 from tslam_bench.scoring.untrusted_zip import COMPRESSIONS, open_zip
 
 MAX_FILES: Final = 20_000
@@ -25,16 +26,14 @@ MAX_FILES: Final = 20_000
 MAX_FILE_SIZE: Final = 64 * 2**20
 """Bytes of one uncompressed file: 64 MiB."""
 MAX_TOTAL_SIZE: Final = 8 * 2**30
-"""Bytes of all uncompressed files: 8 GiB."""
+"""Bytes of all uncompressed files: 8 GiB. What an archive unpacks to costs no more than a folder may, whatever its ratio."""
 MAX_DIRECTORY: Final = 8 * 2**20
 """Bytes of an archive's list of entries: 400 for each of the most files."""
-MAX_COMPRESSION_RATIO: Final = 100
-"""Uncompressed to compressed bytes of a zip entry above ``RATIO_FREE_SIZE``."""
-RATIO_FREE_SIZE: Final = 2**20
-"""Bytes below which the compression ratio of an entry is not looked at: 1 MiB."""
 
 _AS_IT_IS: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-_IGNORED_NAMES = ("readme", "readme.md", "readme.txt", "license", "license.txt", "license.md")
+_AT_THE_TOP: Final = ("readme", "readme.md", "readme.txt", "license", "license.txt", "license.md")
+_LITTER: Final = ("__macosx", "desktop.ini", "thumbs.db", "ehthumbs.db", "icon", "icon\r", "$recycle.bin", "@eadir")
+"""What file managers leave in folders, besides hidden files."""
 
 
 class FileSource:
@@ -42,8 +41,8 @@ class FileSource:
 
     Attributes:
         location: the path as given, for messages.
-        sizes: name with forward slashes, relative to the submission -> uncompressed bytes. Hidden files, ``__MACOSX``
-            and a README or LICENSE at the top are left out.
+        sizes: name with forward slashes, relative to the submission -> uncompressed bytes. Hidden files, what file
+            managers leave in folders, and a README or LICENSE at the top are left out.
     """
 
     def __init__(self, location: str, sizes: dict[str, int]) -> None:
@@ -52,11 +51,13 @@ class FileSource:
             raise InvalidInputError(f"{location}: {len(sizes)} files; at most {MAX_FILES} are read")
         for name, size in sizes.items():
             if size > MAX_FILE_SIZE:
-                raise InvalidInputError(f"{location}: {name} has {size} bytes; at most {MAX_FILE_SIZE} are read")
+                raise InvalidInputError(
+                    f"{location}: {_shown(name)} has {size} bytes; at most {MAX_FILE_SIZE} are read"
+                )
         total = sum(sizes.values())
         if total > MAX_TOTAL_SIZE:
             raise InvalidInputError(f"{location}: {total} bytes uncompressed; at most {MAX_TOTAL_SIZE} are read")
-        self.sizes = {name: size for name, size in sizes.items() if not _ignored(name)}
+        self.sizes = sizes
 
     def only(self, names: Iterable[str]) -> FileSource:
         """The same source with some of its files."""
@@ -90,24 +91,29 @@ class FolderSource(FileSource):
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         sizes: dict[str, int] = {}
-        pending = [folder]
+        pending = [""]
+        seen = 0
         while pending:
+            above = pending.pop()
             try:
-                entries = sorted(os.scandir(pending.pop()), key=lambda entry: entry.name)
+                entries = sorted(os.scandir(folder / above), key=lambda entry: entry.name)
             except OSError as error:
                 raise InvalidInputError(f"{folder}: cannot be read ({error.strerror})") from error
             for entry in entries:
-                name = Path(entry.path).relative_to(folder).as_posix()
+                name = f"{above}{entry.name}"
+                seen += 1
+                if seen > 4 * MAX_FILES:
+                    raise InvalidInputError(f"{folder}: more than {MAX_FILES} files; is this a submission folder?")
+                if _ignored(name):
+                    continue
                 mode = entry.stat(follow_symlinks=False).st_mode
                 if stat.S_ISDIR(mode):
-                    pending.append(Path(entry.path))
+                    pending.append(f"{name}/")
                 elif stat.S_ISREG(mode):
                     sizes[name] = entry.stat(follow_symlinks=False).st_size
                 else:
-                    kind = "a symbolic link" if stat.S_ISLNK(mode) else "not a regular file"
+                    kind = "a symbolic link" if stat.S_ISLNK(mode) else f"{kind_of_file(mode)}, not a regular file"
                     raise InvalidInputError(f"{folder}: {_shown(name)} is {kind}; replace it with the file itself")
-                if len(sizes) + len(pending) > 2 * MAX_FILES:
-                    raise InvalidInputError(f"{folder}: more than {MAX_FILES} files; is this a submission folder?")
         super().__init__(str(folder), sizes)
 
     @contextlib.contextmanager
@@ -123,19 +129,27 @@ class FolderSource(FileSource):
 
 
 class ZipSource(FileSource):
-    """A submission in a zip archive: its files at the top, or in one folder at the top."""
+    """A submission in a zip archive: its files at the top, or in one folder at the top.
+
+    Names may be written as some systems pack them: with backslashes, or with ``./`` before them.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        sizes: dict[str, int] = {}
+        entries: dict[str, zipfile.ZipInfo] = {}
         for entry in self._archive.infolist():
-            if not entry.is_dir():
-                _check_entry(str(path), entry)
-                if entry.filename in sizes:
-                    raise InvalidInputError(f"{path}: {entry.filename} is in the archive twice; pack it again")
-                sizes[entry.filename] = entry.file_size
-        self._prefix = _common_folder([name for name in sizes if not name.startswith("__MACOSX/")])
-        super().__init__(str(path), {name.removeprefix(self._prefix): size for name, size in sizes.items()})
+            name = _plain_name(str(path), entry)
+            if entry.is_dir() or entry.filename.endswith("\\") or _ignored(name):
+                continue
+            _check_entry(str(path), entry)
+            if name in entries:
+                raise InvalidInputError(f"{path}: {_shown(name)} is in the archive twice; pack it again")
+            entries[name] = entry
+        prefix = _common_folder([*entries])
+        inside = {name.removeprefix(prefix): entry for name, entry in entries.items()}
+        inside = {name: entry for name, entry in inside.items() if not _ignored(name)}
+        self._names = {name: entry.filename for name, entry in inside.items()}
+        super().__init__(str(path), {name: entry.file_size for name, entry in inside.items()})
 
     @functools.cached_property
     def _archive(self) -> zipfile.ZipFile:
@@ -150,7 +164,7 @@ class ZipSource(FileSource):
     @contextlib.contextmanager
     def _open(self, name: str) -> Iterator[IO[bytes]]:
         try:
-            with self._archive.open(self._prefix + name) as stream:
+            with self._archive.open(self._names[name]) as stream:
                 yield stream  # it stops at the declared size and checks the CRC
         except (
             OSError,
@@ -170,25 +184,33 @@ def open_source(path: Path) -> FileSource:
     Raises:
         InvalidInputError: it does not exist, is neither, holds links or unsafe names, or exceeds a limit.
     """
-    if path.is_dir():
+    try:
+        mode = path.stat().st_mode
+        archive = stat.S_ISREG(mode) and zipfile.is_zipfile(path)
+    except FileNotFoundError as error:
+        raise InvalidInputError(f"{path}: no such folder or zip archive; check the path") from error
+    except OSError as error:
+        raise InvalidInputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    if stat.S_ISDIR(mode):
         return FolderSource(path)
-    if not path.exists():
-        raise InvalidInputError(f"{path}: no such folder or zip archive; check the path")
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        raise InvalidInputError(f"{path}: neither a folder nor a zip archive; give one that holds submission.json")
-    return ZipSource(path)
+    if archive:
+        return ZipSource(path)
+    raise InvalidInputError(f"{path}: neither a folder nor a zip archive; give one that holds submission.json")
+
+
+def _plain_name(location: str, entry: zipfile.ZipInfo) -> str:
+    """An entry's name with single forward slashes between plain parts. Raises InvalidInputError if it leaves the archive."""
+    name = entry.filename.replace("\\", "/")
+    parts = [part for part in name.split("/") if part not in ("", ".")]
+    if name.startswith("/") or ".." in parts or ":" in name or "\0" in entry.orig_filename:
+        raise InvalidInputError(
+            f"{location}: the entry {_shown(entry.filename)} leaves the archive; pack it again with relative names"
+        )
+    return "/".join(parts)
 
 
 def _check_entry(location: str, entry: zipfile.ZipInfo) -> None:
     name = _shown(entry.filename)
-    parts = entry.filename.split("/")
-    if (
-        any(part in ("", ".", "..") for part in parts)
-        or "\\" in entry.filename
-        or ":" in entry.filename
-        or "\0" in entry.orig_filename
-    ):
-        raise InvalidInputError(f"{location}: the entry {name} leaves the archive; pack it again with relative names")
     mode = entry.external_attr >> 16
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         raise InvalidInputError(f"{location}: {name} is a link or special file; replace it with the file itself")
@@ -196,10 +218,6 @@ def _check_entry(location: str, entry: zipfile.ZipInfo) -> None:
         raise InvalidInputError(f"{location}: {name} is encrypted; pack it without a password")
     if entry.compress_type not in COMPRESSIONS:
         raise InvalidInputError(f"{location}: {name} uses an unusual compression; pack it with deflate")
-    if entry.file_size > RATIO_FREE_SIZE and entry.file_size > MAX_COMPRESSION_RATIO * max(entry.compress_size, 1):
-        raise InvalidInputError(
-            f"{location}: {name} unpacks to more than {MAX_COMPRESSION_RATIO} times its size; refused"
-        )
 
 
 def _common_folder(names: list[str]) -> str:
@@ -211,8 +229,8 @@ def _common_folder(names: list[str]) -> str:
 
 
 def _ignored(name: str) -> bool:
-    parts = name.split("/")
-    return parts[0] == "__MACOSX" or any(part.startswith(".") for part in parts) or name.lower() in _IGNORED_NAMES
+    parts = [part.lower() for part in name.split("/")]
+    return name.lower() in _AT_THE_TOP or any(part.startswith(".") or part in _LITTER for part in parts)
 
 
 def _shown(name: str) -> str:

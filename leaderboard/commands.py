@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
+from tslam_bench.cli.batch import Batch
 from tslam_bench.cli.progress import Progress
 from tslam_bench.cli.score import check_workers
 from tslam_bench.constants import QUICK_OBJECTS
@@ -70,13 +70,22 @@ def page_main(arguments: Sequence[str]) -> None:
     score_files, submission_paths = find_inputs(paths)
     if not score_files and not submission_paths:
         raise InvalidInputError(f"{paths[0]}: holds neither submissions nor score files; run tslam-bench score first")
-    scores = [read_score(path) for path in score_files]
+    batch = Batch("tslam-bench leaderboard", len(score_files) + len(submission_paths))
+    scores: list[SubmissionScore] = []
+    for path in score_files:
+        with batch.item(str(path)):
+            scores.append(read_score(path))
     submissions: dict[str, Submission] = {}
     for path in submission_paths:
-        submission = read_submission(path)
-        submissions.setdefault(submission.content_hash, submission)
+        with batch.item(str(path)):
+            submission = read_submission(path)
+            submissions.setdefault(submission.content_hash, submission)
+    if not scores and not submissions:
+        batch.finish("there is nothing to show")
     _check_output(parsed.output)  # before hours of scoring, not after
-    scores = _score_missing(scores, submissions, parsed.workers, parsed.trust_scores)
+    scores = _score_missing(scores, submissions, parsed.workers, parsed.trust_scores, batch)
+    if not scores:
+        batch.finish("there is nothing to show")
     leaderboard = rank(scores)
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
@@ -91,9 +100,10 @@ def page_main(arguments: Sequence[str]) -> None:
         temporary.write_text(html, encoding="utf-8")
     if parsed.json:
         print(json.dumps(leaderboard, indent=2, sort_keys=True))
-        return
-    entries = sum(len(table["entries"]) for table in leaderboard["tables"])
-    print(f"{parsed.output / PAGE_FILE}: {entries} entries, {len(html.encode()) / 2**20:.1f} MiB")
+    else:
+        entries = sum(len(table["entries"]) for table in leaderboard["tables"])
+        print(f"{parsed.output / PAGE_FILE}: {entries} entries, {len(html.encode()) / 2**20:.1f} MiB")
+    batch.finish("the page shows the others")
 
 
 def _check_output(folder: Path) -> None:
@@ -127,7 +137,7 @@ def find_inputs(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
             beside = [path.parent / "submissions"] if path.name == "scores" else []
             for folder in (path, path / "scores", path / "submissions", *beside):
                 for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
-                    if (entry / INFO_FILE).is_file() or (entry.suffix == ".zip" and zipfile.is_zipfile(entry)):
+                    if (entry / INFO_FILE).is_file() or (entry.suffix == ".zip" and entry.is_file()):
                         submissions[entry] = None
                     elif entry.suffix == ".json" and is_score_file(entry):
                         scores[entry] = None
@@ -163,7 +173,7 @@ def plan_pictures(
 
 
 def _score_missing(
-    scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int, trust: bool
+    scores: list[SubmissionScore], submissions: dict[str, Submission], workers: int, trust: bool, batch: Batch
 ) -> list[SubmissionScore]:
     """Adds scores of submissions that have none.
 
@@ -175,7 +185,8 @@ def _score_missing(
     missing = [submission for key, submission in submissions.items() if key not in scored]
     with worker_pool(workers if missing else 1) as pool:
         for submission in missing:
-            with Progress(f"score {Path(submission.location).name}", "object", leave=False) as bar:
+            name = Path(submission.location).name
+            with batch.item(submission.location), Progress(f"score {name}", "object", leave=False) as bar:
                 objects = before.get(submission.content_hash)
                 current.append(score_submission(submission, objects, pool, bar.show))
     return current

@@ -6,11 +6,13 @@ and a run that was killed goes on.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tslam_bench.constants import GRID_SIZE, NUM_POSES, OCCUPANCY_THRESHOLD
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 from tslam_bench.files import atomic_file
 from tslam_bench.geometry.render import Camera, Colour, fit_camera, render, voxels_to_mesh
 from tslam_bench.grids import voxel_centres
@@ -94,7 +96,10 @@ def make_pictures(
         on_progress: called with (done, all).
         cache: asset cache.
     """
-    paths = {picture: folder / picture.file_name(_asset(picture.object, cache)) for picture in pictures}
+    paths: dict[Picture, Path] = {}
+    for picture in pictures:
+        with contextlib.suppress(AssetError):  # its object is not prepared here
+            paths[picture] = folder / picture.file_name(_asset(picture.object, cache))
     missing = [picture for picture in paths if not paths[picture].is_file()]
     done = len(paths) - len(missing)
     if on_progress:
@@ -109,19 +114,26 @@ def make_pictures(
                 on_progress(done, len(paths))
     else:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(workers, len(groups)), mp_context=context) as pool:
+        # A process that dies leaves its pictures out, and those of the others that wait.
+        with (
+            contextlib.suppress(BrokenProcessPool),
+            ProcessPoolExecutor(min(workers, len(groups)), mp_context=context) as pool,
+        ):
             for drawn in pool.map(_draw_group, arguments):
                 done += drawn
                 if on_progress:
                     on_progress(done, len(paths))
-    content = {picture: path.read_bytes() for picture, path in paths.items()}
+    content = {picture: path.read_bytes() for picture, path in paths.items() if path.is_file()}
     return {picture: data for picture, data in content.items() if data}
 
 
 def _draw_group(arguments: tuple[list[tuple[Picture, Path]], Path | None]) -> int:
     pictures, cache = arguments
     for picture, path in pictures:
-        data = draw(picture, load_object(picture.object, cache=cache))
+        try:
+            data = draw(picture, load_object(picture.object, cache=cache))
+        except BenchmarkError:  # the submission has changed since it was read, or its object is not prepared: left out
+            continue
         with atomic_file(path) as temporary:
             temporary.write_bytes(data)
     return len(pictures)

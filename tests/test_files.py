@@ -15,7 +15,7 @@ import pytest
 
 from tslam_bench.cli import main
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_directory, ensure_writable_directory, place_to_write, write_json
+from tslam_bench.files import atomic_directory, ensure_writable_directory, place_to_write, read_plain_file, write_json
 
 
 def make(kind: str, path: Path) -> None:
@@ -185,3 +185,37 @@ def test_a_full_disk_behind_standard_output_is_one_line() -> None:
         done = subprocess.run([sys.executable, "-c", code], stdout=stream, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2, done.stderr
     assert done.stderr.splitlines() == ["tslam-bench: No space left on device"]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_may_never_end_is_not_read(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "in.json"
+    make(kind, path) if kind != "device" else path.symlink_to("/dev/zero")
+    with pytest.raises(InvalidInputError, match=r"in.json: (is a (pipe|device), no file|cannot be read)"):
+        read_plain_file(path, 1000)
+
+
+def test_files_are_read_up_to_the_limit(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(bytes(10))
+    assert read_plain_file(tmp_path / "a", 10) == bytes(10)
+    with pytest.raises(InvalidInputError, match="more than 9 bytes"):
+        read_plain_file(tmp_path / "a", 9)
+    with pytest.raises(InvalidInputError, match="no such file"):
+        read_plain_file(tmp_path / "b", 9)
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda path: main(["reconstruct", "run", "--touched", str(path), "--output", f"{path}.ply"]),
+        lambda path: main(["score", str(path)]),
+        lambda path: main(["leaderboard", str(path), "--output", str(path.parent / "page")]),
+        lambda path: main(["assets", "import", str(path), "--output", "mine"]),
+    ],
+)
+def test_no_command_waits_for_a_pipe(read, tmp_path: Path, capsys) -> None:
+    for name in ("in.npz", "in.json", "in.zip", "in.obj"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(SystemExit) as caught:
+            read(tmp_path / name)
+        assert caught.value.code == 2

@@ -22,6 +22,7 @@ _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.E
 """What a disk says that takes no more, whoever writes to it."""
 _TAKEN: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES)
 """What a system says of a directory that is to be put where one stands."""
+_WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
 _KINDS: Final = {
     stat.S_IFDIR: "a folder",
     stat.S_IFCHR: "a device",
@@ -120,6 +121,27 @@ def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
         read = Path(os.path.realpath(given))
         if read == place or read in place.parents:
             raise InvalidInputError(f"{path}: would be written into {given}, which is read; name another place")
+
+
+def read_plain_file(path: Path, most: int) -> bytes:
+    """Bytes of a file of at most ``most`` bytes; nothing that could wait for ever or never end is read.
+
+    Raises:
+        InvalidInputError: it is missing, larger, a pipe, a device or a folder, or may not be read.
+    """
+    try:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _WITHOUT_WAITING)) as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise InvalidInputError(f"{path}: is {kind_of_file(status.st_mode)}, no file; check the path")
+            data = stream.read(most + 1)
+    except FileNotFoundError as error:
+        raise InvalidInputError(f"{path}: no such file; check the path") from error
+    except OSError as error:
+        raise InvalidInputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    if len(data) > most:
+        raise InvalidInputError(f"{path}: has more than {most} bytes; at most that many are read")
+    return data
 
 
 @contextlib.contextmanager

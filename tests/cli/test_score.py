@@ -7,7 +7,8 @@ import os
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
+import textwrap
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from scored_run import NAMES, fake_score, info
 
 from tslam_bench.cli import main
 from tslam_bench.cli.score import object_table, score_main, summary_table
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.scoring.scoring import score_submission, worker_pool
 from tslam_bench.scoring.submission import SubmissionWriter, read_submission
 from tslam_bench.scoring.untrusted_scores import parse_score
@@ -60,13 +61,55 @@ def test_an_entry_of_few_seeds_says_so(object_set, seeds, full: bool, tmp_path: 
     assert any("reconstruction of 1 pose, reconstruction of 2 poses" in note for note in notes)
 
 
-def test_each_score_is_written_as_soon_as_it_is_there(run: Path, tmp_path: Path) -> None:
-    """The second submission is refused; the first one's score is there all the same."""
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_one_bad_submission_takes_no_other_with_it(form: list[str], run: Path, tmp_path: Path, capsys) -> None:
+    """Some are refused when they are read, one changes before its turn; the others are scored, written and shown."""
     (tmp_path / "broken").mkdir()
-    with pytest.raises(InvalidInputError, match="broken"):
-        paths = [str(run / "submissions" / "random-grid"), str(tmp_path / "broken")]
-        score_main([*paths, "--objects", "mug", "--output", str(tmp_path / "scores")])
-    assert [p.name for p in (tmp_path / "scores").iterdir()] == ["random-grid.json"]
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w"):
+        pass
+    os.mkfifo(tmp_path / "pipe")
+    names = ("random-grid", "mine-hull")
+    paths = ["broken", "random-grid", "empty.zip", "pipe", "nowhere", "mine-hull"]
+    arguments = [str(run / "submissions" / name) if name in names else str(tmp_path / name) for name in paths]
+    with pytest.raises(InvalidInputError, match=r"4 of 6 failed, see above: .*broken, .*; the others are scored"):
+        score_main([*arguments, "--objects", "mug", "--output", str(tmp_path / "scores"), *form])
+    assert sorted(p.name for p in (tmp_path / "scores").iterdir()) == ["mine-hull.json", "random-grid.json"]
+    printed, error = capsys.readouterr()
+    lines = [line for line in error.splitlines() if line.startswith("tslam-bench score: ")]
+    assert len(lines) == 4 and all(
+        name in line for name, line in zip(("broken", "empty", "pipe", "nowhere"), lines, strict=True)
+    )
+    if form:
+        assert [value["submission"]["explorer"] for value in json.loads(printed)] == ["random", "mine"]
+    else:
+        assert "random + grid" in printed and "<b>Mine</b>" in printed
+
+
+def test_figures_are_shown_if_they_cannot_be_written(run: Path, tmp_path: Path, primitive_cache: Path) -> None:
+    """A disk that is full after minutes of scoring."""
+    code = f"""
+        import resource
+        from tslam_bench.cli import main
+        arguments = ["score", {str(run / "submissions/random-grid")!r}, "--objects", "mug"]
+        main(arguments)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        main([*arguments, "--output", {str(tmp_path / "score.json")!r}])
+    """
+    environment = {**os.environ, "TSLAM_BENCH_CACHE": str(primitive_cache)}
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stdout.count("random + grid, per object") == 2, done.stderr
+    assert "score.json: cannot be written (File too large); make room" in done.stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_takes_one_submission_with_it() -> None:
+    with worker_pool(2) as pool:
+        assert pool is not None
+        with pytest.raises(AssetError, match="was killed, probably for want of memory"):
+            list(pool.map(os._exit, [1]))
+        assert list(pool.map(abs, [-1, 2])) == [1, 2]
 
 
 def test_several_scores_go_to_a_folder(run: Path, tmp_path: Path) -> None:
@@ -121,7 +164,7 @@ def test_names_with_dots_do_not_meet(run: Path, tmp_path: Path, monkeypatch: pyt
 def test_processes_do_not_change_the_score(run: Path, primitive_cache: Path) -> None:
     path = run / "submissions" / "mine-hull"
     with worker_pool(2) as pool:
-        assert isinstance(pool, ProcessPoolExecutor)
+        assert pool is not None
         in_processes = [score_submission(path, NAMES, pool, cache=primitive_cache).to_json() for _ in range(2)]
     assert in_processes == 2 * [score_submission(path, NAMES, cache=primitive_cache).to_json()]
 

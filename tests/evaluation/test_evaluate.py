@@ -271,7 +271,7 @@ def test_stored_episode_comes_back(rollouts, tmp_path: Path) -> None:
     path.with_name("pose3_seed0.npz").write_bytes(path.read_bytes()[:500])
     for name, reason in (
         ("pose3_seed0.npz", "truncated"),
-        ("pose4_seed0.npz", "cannot be read"),
+        ("pose4_seed0.npz", "no such file"),
         ("a.npz", "the name"),
     ):
         with pytest.raises(InvalidInputError, match=f"{name}: .*{reason}"):

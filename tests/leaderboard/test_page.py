@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 import shutil
 import time
+import zipfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -345,6 +347,40 @@ def test_of_two_scores_of_one_submission_the_one_made_here_stays_in_any_order(ru
     assert (
         entry["aggregate"]["areas"]["iou_area"]["mean"] < 1 and len(json.loads(boards[2])["tables"][0]["entries"]) == 1
     )
+
+
+def test_bad_items_are_left_out_of_the_page_and_named(run: Path, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "entries"
+    shutil.copytree(run / "scores", folder)
+    (folder / "broken").mkdir()
+    (folder / "broken" / "submission.json").write_text("{}")
+    with zipfile.ZipFile(folder / "empty.zip", "w"):
+        pass
+    (folder / "lies.json").write_text('{"score_version": 3}')
+    (folder / "notes.json").write_text("[1]")  # no score file: not looked at
+    (folder / "nested.json").write_text("[" * 100_000)
+    for name in ("pipe.json", "pipe.zip"):
+        os.mkfifo(folder / name)
+    with pytest.raises(InvalidInputError, match=r"3 of 7 failed, see above: .*; the page shows the others"):
+        page_main([str(folder), "--output", str(tmp_path / "page")])
+    assert len(json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]) == 4
+    Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
+    printed, error = capsys.readouterr()
+    lines = [line for line in error.splitlines() if line.startswith("tslam-bench leaderboard: ")]
+    assert "4 entries" in printed and len(lines) == 3
+    assert all(any(name in line for line in lines) for name in ("lies.json", "broken", "empty.zip"))
+    for path in folder.glob("*-*.json"):
+        path.unlink()
+    with pytest.raises(InvalidInputError, match=r"3 of 3 failed, .*; there is nothing to show"):
+        page_main([str(folder), "--output", str(tmp_path / "other")])
+    assert not (tmp_path / "other" / "index.html").exists()
+
+
+def test_a_page_is_built_where_no_object_is_prepared(run: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("TSLAM_BENCH_CACHE", str(tmp_path / "empty"))
+    page_main([str(run), "--output", str(tmp_path / "page"), "--trust-scores"])
+    parsed = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
+    assert parsed.all("img") == [] and len(parsed.all("tr")) > 4
 
 
 def test_unscored_submissions_are_scored_by_the_leaderboard(run: Path, tmp_path: Path, monkeypatch) -> None:

@@ -207,7 +207,7 @@ def test_large_files_folders_and_missing_ones_are_refused(run: Path, tmp_path: P
     monkeypatch.setattr(untrusted_scores, "MAX_SCORE_SIZE", 1000)
     for path, reason in (
         (run / "scores" / "random-grid.json", "more than 1000 bytes"),
-        (tmp_path, "no plain one"),
+        (tmp_path, "Is a directory"),
         (tmp_path / "none.json", "no such file"),
     ):
         with pytest.raises(InvalidInputError, match=reason):

@@ -203,6 +203,16 @@ def test_an_archive_with_one_mesh(tmp_path):
     np.testing.assert_allclose(read_mesh_file(path).extents, EXTENTS, atol=1e-6)
 
 
+def test_litter_in_an_archive_is_no_second_mesh(tmp_path):
+    """Finder packs a shadow of every file."""
+    path = tmp_path / "shape.zip"
+    model = l_shape().export(file_type="stl")
+    path.write_bytes(
+        archive({"model.stl": model, "__MACOSX/._model.stl": b"x", "._model.stl": b"x", ".cache/a.obj": b"x"})
+    )
+    np.testing.assert_allclose(read_mesh_file(path).extents, EXTENTS, atol=1e-6)
+
+
 HARMLESS = ("chain.glb", "count.dae", "outside.obj", "parents.glb", "polygon.off", "views.glb")
 """Files that overstate or repeat what is not used, or name a file that is not read: they are taken for what they hold."""
 

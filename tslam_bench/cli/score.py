@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,9 +13,10 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from tslam_bench.cli.batch import Batch
 from tslam_bench.cli.progress import Progress
 from tslam_bench.cli.terminal import cell
-from tslam_bench.errors import InvalidInputError
+from tslam_bench.errors import BenchmarkError, InvalidInputError
 from tslam_bench.files import check_output
 from tslam_bench.scoring.figures import FIGURES, IOU_AREA, interval, means
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore
@@ -54,18 +55,38 @@ def score_main(arguments: Sequence[str]) -> None:
         raise InvalidInputError("score: name at least one submission, a folder or a zip archive")
     check_workers(parsed.workers)
     files = _score_files(parsed.submissions, parsed.output)
-    submissions, records = _with_records(parsed.submissions, parsed.verification)
-    scores = []
+    batch = Batch("tslam-bench score", len(parsed.submissions))
+    submissions: dict[Path, Submission] = {}
+    for path in parsed.submissions:  # all of them first: what is refused is known before hours of scoring, not after
+        with batch.item(str(path)):
+            submissions[path] = read_submission(path)
+    records = _records(parsed.verification, submissions.values())
+    scores: list[SubmissionScore] = []
+    unwritten: list[BenchmarkError] = []
     with worker_pool(parsed.workers) as pool:
-        for path, file, submission in zip(parsed.submissions, files, submissions, strict=True):
-            with Progress(f"score {path.name}", "object", leave=False) as bar:
+        for path, file in zip(parsed.submissions, files, strict=True):
+            if path not in submissions:
+                continue
+            with batch.item(str(path)), Progress(f"score {path.name}", "object", leave=False) as bar:
+                submission = submissions[path]
                 record = records.get(submission.content_hash)
                 scores.append(score_submission(submission, parsed.objects or None, pool, bar.show, record=record))
-            if file is not None:
-                write_score(file, scores[-1])
-    if parsed.json:
+                if file is not None:
+                    try:
+                        write_score(file, scores[-1])
+                    except BenchmarkError as error:  # a full disk, say: the figures are there to be seen all the same
+                        unwritten.append(error)
+    if scores:
+        _print_scores(scores, parsed.json, len(parsed.submissions))
+    batch.finish("the others are scored" if scores else "none is scored")
+    if unwritten:
+        raise unwritten[0]
+
+
+def _print_scores(scores: Sequence[SubmissionScore], as_json: bool, asked: int) -> None:
+    if as_json:
         values = [sealed_json(score) for score in scores]
-        print(json.dumps(values[0] if len(values) == 1 else values, indent=2, sort_keys=True))
+        print(json.dumps(values[0] if asked == 1 else values, indent=2, sort_keys=True))
         return
     console = Console()
     if not console.is_terminal:
@@ -78,25 +99,20 @@ def score_main(arguments: Sequence[str]) -> None:
             console.print(cell("note", "yellow"), cell(f"{score.info.method}: {note}"))
 
 
-def _with_records(
-    paths: Sequence[Path], record_files: Sequence[Path]
-) -> tuple[Iterable[Submission], dict[str, VerificationRecord]]:
-    """The submissions, read when their turn comes, and the records by content hash; each is of one of the submissions.
+def _records(files: Sequence[Path], submissions: Collection[Submission]) -> dict[str, VerificationRecord]:
+    """The records by content hash; each is of one of the submissions.
 
     Raises:
-        InvalidInputError: a record is not to be trusted, or is of other files. Known before hours of scoring, not after.
+        InvalidInputError: a record is not to be trusted, or is of other files.
     """
-    submissions: Iterable[Submission] = map(read_submission, paths)
-    if not record_files:
-        return submissions, {}
-    submissions = list(submissions)
+    hashes = {submission.content_hash for submission in submissions}
     records = {}
-    for file in record_files:
+    for file in files:
         record = VerificationRecord.read(file)
-        if record.content_hash not in {submission.content_hash for submission in submissions}:
+        if record.content_hash not in hashes:
             raise InvalidInputError(f"{file}: made for other files than the given submissions; run verify again")
         records[record.content_hash] = record
-    return submissions, records
+    return records
 
 
 def summary_table(scores: Sequence[SubmissionScore]) -> Table:

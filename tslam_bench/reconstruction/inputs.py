@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -11,9 +12,11 @@ from numpy.typing import NDArray
 from tslam_bench import grids
 from tslam_bench.constants import GRID_SIZE
 from tslam_bench.errors import InvalidInputError
+from tslam_bench.files import read_plain_file
 from tslam_bench.reconstruction.volume import Volume
 
 GRID_SHAPE = (GRID_SIZE,) * 3
+_MAX_SIZE = 64 * 2**20
 _REMEDY = "give an .npz file with the arrays 'touched' and 'visited'"
 
 
@@ -50,12 +53,12 @@ def read_grids(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     Raises:
         InvalidInputError: the file cannot be read, lacks ``touched``, or an array has another form.
     """
+    data = read_plain_file(path, _MAX_SIZE)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in ("touched", "visited") if name in file.files}
     except (OSError, ValueError, EOFError, BadZipFile, AttributeError, TypeError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else "not an .npz file of plain arrays"
-        raise InvalidInputError(f"{path}: {reason}; {_REMEDY}") from error
+        raise InvalidInputError(f"{path}: not an .npz file of plain arrays; {_REMEDY}") from error
     if "touched" not in arrays:
         raise InvalidInputError(f"{path}: has no array 'touched'; {_REMEDY}")
     arrays.setdefault("visited", np.zeros(GRID_SHAPE, dtype=bool))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from tslam_bench.errors import AssetError
-from tslam_bench.files import write_json
+from tslam_bench.files import read_plain_file, write_json
 from tslam_bench.scoring.seal import seal, sealed_here
 from tslam_bench.scoring.submission import Submission
 from tslam_bench.scoring.untrusted_json import parse_json
@@ -36,13 +36,10 @@ def write_origin(submission: Submission) -> None:
 
 def has_origin(submission: Submission) -> bool:
     """Whether the note beside a submission says that its explorer made these very files here."""
-    path = beside(submission.location, SUFFIX)
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_SIZE:
-            return False
-        content = parse_json(path.read_bytes())
+        content = parse_json(read_plain_file(beside(submission.location, SUFFIX), _MAX_SIZE))
         claimed = content.pop("seal", None)
         own = {"content_hash": submission.content_hash, "explorer": submission.info.explorer}
         return content == own and sealed_here(content, claimed)
-    except (OSError, ValueError, AttributeError, AssetError):
+    except (ValueError, AttributeError, AssetError):
         return False

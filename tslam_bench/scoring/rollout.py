@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS
 from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import atomic_file
+from tslam_bench.files import atomic_file, read_plain_file
 from tslam_bench.grids import pack, unpack
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
+from tslam_bench.scoring.untrusted_files import MAX_FILE_SIZE
 
 ROLLOUT_FORMAT: Final = 2
 """Version of a file's content."""
@@ -171,8 +172,4 @@ class Rollout:
         episode = parse_rollout_file("/".join(path.parts[-2:]))
         if episode is None:
             raise InvalidInputError(f"{path}: not the name of a rollout, <object>/pose<k>_seed<s>.npz")
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise InvalidInputError(f"{path}: cannot be read ({error.strerror}); let it be explored again") from error
-        return cls.from_bytes(data, episode, str(path))
+        return cls.from_bytes(read_plain_file(path, MAX_FILE_SIZE), episode, str(path))

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from tslam_bench.errors import AssetError
 from tslam_bench.objects.splits import object_set, resolve_name
@@ -29,21 +30,54 @@ EXPECTED_IMPLAUSIBLE: Final = 0.02
 hulls, the field's gradient is no longer the way out. Of 450 honest sets of eight poses, eight had any, at most 0.8 %."""
 
 
+class WorkerPool:
+    """Processes that score objects and keep what they loaded for the next submission.
+
+    One that dies (a system without memory kills the largest) takes the submission with it that was scored, not the next ones.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+        self._processes: ProcessPoolExecutor | None = None
+
+    def map(self, function: Callable[..., Any], *values: Iterable[Any]) -> Iterator[Any]:
+        """As the builtin. Raises AssetError if a process dies."""
+        if self._processes is None:
+            # spawn: a forked copy of a process whose libraries have started threads may hang
+            context = multiprocessing.get_context("spawn")
+            self._processes = ProcessPoolExecutor(self._workers, mp_context=context)
+        try:
+            yield from self._processes.map(function, *values)
+        except BrokenProcessPool as error:
+            self.close()
+            raise AssetError(
+                "a process that scored was killed, probably for want of memory; free some, or score with --workers 1"
+            ) from error
+
+    def close(self) -> None:
+        """Ends the processes; the next call of :meth:`map` starts others."""
+        processes, self._processes = self._processes, None
+        if processes is not None:
+            processes.shutdown(cancel_futures=True)
+
+
 @contextlib.contextmanager
-def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Processes for :func:`score_submission`, which keep what they loaded for the next submission; None for one worker."""
+def worker_pool(workers: int) -> Iterator[WorkerPool | None]:
+    """Processes for :func:`score_submission`; None for one worker."""
     if workers <= 1:
         yield None
         return
-    # spawn: a forked copy of a process whose libraries have started threads may hang
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    pool = WorkerPool(workers)
+    try:
         yield pool
+    finally:
+        pool.close()
 
 
 def score_submission(
     submission: Submission | Path | str,
     objects: Sequence[str] | None = None,
-    pool: ProcessPoolExecutor | None = None,
+    pool: WorkerPool | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     cache: Path | None = None,
     record: VerificationRecord | None = None,

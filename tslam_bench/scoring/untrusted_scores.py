@@ -17,7 +17,7 @@ import numpy as np
 
 from tslam_bench.constants import HORIZON, PROTOCOL_VERSION
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import write_json
+from tslam_bench.files import read_plain_file, write_json
 from tslam_bench.objects.splits import OBJECTS
 from tslam_bench.scoring.aggregate import Estimate
 from tslam_bench.scoring.info import SubmissionInfo, check_info
@@ -104,16 +104,9 @@ def parse_score(value: Any, where: str) -> SubmissionScore:
 
 
 def _parse(path: Path) -> Any:
+    data = read_plain_file(path, MAX_SCORE_SIZE)
     try:
-        if not path.is_file():
-            raise InvalidInputError(f"{path}: no such file, or no plain one; check the path")
-        if path.stat().st_size > MAX_SCORE_SIZE:
-            raise InvalidInputError(f"{path}: not a score file (more than {MAX_SCORE_SIZE} bytes); {_REMEDY}")
-        return parse_json(path.read_bytes())
-    except OSError as error:
-        raise InvalidInputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    except InvalidInputError:
-        raise
+        return parse_json(data)
     except ValueError as error:
         reason = " ".join(str(error).split())[:120]
         raise InvalidInputError(f"{path}: not a score file ({reason}); {_REMEDY}") from error

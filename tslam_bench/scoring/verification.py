@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tslam_bench.constants import GRID_SIZE, HORIZON, PROTOCOL_VERSION
 from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import write_json
+from tslam_bench.files import read_plain_file, write_json
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.origin import beside
 from tslam_bench.scoring.rollout import Rollout
@@ -171,9 +171,7 @@ class VerificationRecord:
         """
         remedy = "run tslam-bench verify again"
         try:
-            if path.stat().st_size > MAX_RECORD_SIZE:
-                raise InvalidInputError(f"{path}: more than {MAX_RECORD_SIZE} bytes; {remedy}")
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(read_plain_file(path, MAX_RECORD_SIZE))
             claimed = content.pop("seal")
             if content["record_version"] != RECORD_VERSION or content["protocol_version"] != PROTOCOL_VERSION:
                 raise InvalidInputError(f"{path}: a verification record of another version; {remedy}")
@@ -181,8 +179,6 @@ class VerificationRecord:
                 raise InvalidInputError(f"{path}: not made here, or changed since; {remedy}")
             fields = {k: v for k, v in content.items() if k not in ("record_version", "protocol_version", "verdicts")}
             return VerificationRecord(**fields, verdicts=tuple(Verdict(**v) for v in content["verdicts"]))
-        except OSError as error:
-            raise InvalidInputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             if isinstance(error, InvalidInputError):
                 raise

@@ -18,7 +18,8 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from tslam_bench.errors import AssetError
+from tslam_bench.errors import AssetError, InvalidInputError
+from tslam_bench.files import read_plain_file
 from tslam_bench.geometry.meshes import TriangleMesh
 from tslam_bench.sources import collada, gltf
 
@@ -72,9 +73,11 @@ def read_mesh_file(path: Path, up: UpAxis = "auto") -> TriangleMesh:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise AssetError(f"{size / 1e6:.0f} MB; the limit is {MAX_BYTES / 1e6:.0f} MB")
-        data = path.read_bytes()
+        data = read_plain_file(path, MAX_BYTES)
     except OSError as error:
         raise AssetError(f"cannot be read ({error.strerror or error})") from error
+    except InvalidInputError as error:
+        raise AssetError(str(error).removeprefix(f"{path}: ")) from error
     files: dict[str, bytes] = {}
     if suffix in ARCHIVE_SUFFIXES:
         name, files = _unpack(data)
@@ -241,7 +244,12 @@ def _unpack(data: bytes) -> tuple[str, dict[str, bytes]]:
                 raise AssetError(
                     f"archive unpacks to {total / 1e6:.0f} MB from {len(data) / 1e6:.2f} MB: refused as a bomb"
                 )
-            meshes = [m.filename for m in members if PurePosixPath(m.filename).suffix.lower() in MESH_SUFFIXES]
+            meshes = [
+                m.filename
+                for m in members
+                if PurePosixPath(m.filename).suffix.lower() in MESH_SUFFIXES
+                and not any(part.startswith(".") or part == "__MACOSX" for part in PurePosixPath(m.filename).parts)
+            ]
             if len(meshes) != 1:
                 raise AssetError(f"archive holds {len(meshes)} meshes; expected one")
             files = {}

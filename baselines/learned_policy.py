@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tslam_bench.constants import HORIZON, NUM_JOINTS
+from tslam_bench.constants import NUM_JOINTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.policy import check_observation, episode_generators
-from tslam_bench.hand_constants import CONTROL_MODES
+from tslam_bench.evaluation.weights import shipped_weights
 
 from .model_files import read_model
 from .network import PolicyNetwork
@@ -50,36 +50,35 @@ class LearnedBaseline:
         self._step = 0
 
     @classmethod
-    def load(cls, baseline: str, model: Path | None = None, deterministic: bool = False) -> LearnedBaseline:
+    def load(
+        cls, baseline: str, model: Path | None = None, seed: int | None = None, deterministic: bool = False
+    ) -> LearnedBaseline:
         """The policy of a learned baseline.
 
         Args:
-            baseline: id, for messages.
-            model: directory that ``tslam-bench baselines train`` wrote.
+            baseline: its id.
+            model: directory that ``tslam-bench baselines train`` wrote, or a file of weights; None loads shipped weights.
+            seed: of the training whose shipped weights are loaded; None is 0.
             deterministic: act by the mean.
 
         Raises:
-            InvalidInputError: no directory, an unfinished or unreadable model; the message gives the training command.
+            InvalidInputError: both model and seed, an unfinished or unreadable model, or no weights of this seed; the message
+                gives the training command.
         """
-        command = f"tslam-bench baselines train {baseline} --output {model or 'DIRECTORY'}"
-        if model is None:
+        if model is not None and seed is not None:
             raise InvalidInputError(
-                f"policy {baseline!r}: needs a trained model; pass its directory, or train one: {command}"
+                f"policy {baseline!r}: training seed {seed} names shipped weights; leave out {model}"
             )
+        path = shipped_weights(baseline, seed or 0) if model is None else Path(model)
         try:
-            network, metadata = read_model(model)
+            network, acting = read_model(path)
         except InvalidInputError as error:
-            raise InvalidInputError(f"{error}; train it: {command}") from error
-        config = metadata["config"]
-        mode, repeat = config.get("control_mode"), config.get("action_repeat")
-        if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
+            remedy = f"train it: tslam-bench baselines train {baseline} --output {path}"
             raise InvalidInputError(
-                f"{model}: control_mode {mode!r} or action_repeat {repeat!r} is unusable; train it: {command}"
-            )
-        correlation = config.get("noise_correlation", 0.0)
-        if not isinstance(correlation, int | float) or not 0 <= correlation <= 1:
-            raise InvalidInputError(f"{model}: noise_correlation {correlation!r} is unusable; train it: {command}")
-        return cls(network, mode, repeat, deterministic, float(correlation))
+                f"{error}; {remedy if model is not None else 'install the package again'}"
+            ) from error
+        repeat, correlation = acting["action_repeat"], float(acting["noise_correlation"])
+        return cls(network, acting["control_mode"], repeat, deterministic, correlation)
 
     def reset(self, num_envs: int, seed: int | Sequence[int]) -> None:
         """See :class:`tslam_bench.evaluation.policy.Policy`."""

@@ -1,7 +1,8 @@
-"""Trained models on disk: a directory with ``model.safetensors`` (the weights) and ``model.json`` (everything else).
+"""Trained models on disk.
 
-Neither file can carry code. ``model.json`` holds the recipe (``config``), the budget (``steps``, ``seconds``), machine, versions
-and command.
+A *model* is a directory with ``model.safetensors`` (the weights) and ``model.json`` (everything else): the recipe (``config``),
+the budget (``steps``, ``seconds``), machine, versions and command. *Weights* are one file in half precision, which says in its
+header what is needed to act with it. None of them can carry code.
 """
 
 from __future__ import annotations
@@ -9,16 +10,25 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save, save_file
 
+from tslam_bench.constants import HORIZON
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE
+from tslam_bench.evaluation.weights import METADATA_FILE, MODEL_FILE
 from tslam_bench.files import atomic_file, write_json
+from tslam_bench.hand_constants import CONTROL_MODES
 
 from .network import NETWORKS, PolicyNetwork
+
+ACTING: Final = ("network", "clock", "state_std", "control_mode", "action_repeat", "noise_correlation")
+"""Settings of the recipe that a policy acts by; weights hold them in their header."""
+_HEADER: Final = "acting"
+_DEFAULTS: Final[dict[str, Any]] = {"clock": 0, "state_std": False, "noise_correlation": 0.0}
+"""Of settings that older recipes did not have."""
 
 
 def make_network(
@@ -48,25 +58,61 @@ def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, 
     write_json(directory / METADATA_FILE, metadata)
 
 
-def read_model(directory: Path) -> tuple[PolicyNetwork, dict[str, Any]]:
-    """The network, in float32, and ``model.json`` of a finished model.
+def weights_bytes(network: PolicyNetwork, acting: Mapping[str, Any]) -> bytes:
+    """A file of weights in half precision; equal arguments give equal bytes.
+
+    Args:
+        network: the policy.
+        acting: its :data:`ACTING`.
+    """
+    weights = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
+    return save(weights, {_HEADER: json.dumps({name: acting[name] for name in ACTING}, sort_keys=True)})
+
+
+def read_model(path: Path) -> tuple[PolicyNetwork, dict[str, Any]]:
+    """A policy and what it acts by.
+
+    Args:
+        path: directory of a finished model, or a file of weights.
+
+    Returns:
+        The network, in float32, and its :data:`ACTING`.
 
     Raises:
-        InvalidInputError: a file is missing or damaged, or the weights are not those of the network it names.
+        InvalidInputError: a file is missing or damaged, the weights are not those of the network it names, or a setting is
+            unusable.
     """
-    directory = Path(directory)
-    for name in (MODEL_FILE, METADATA_FILE):
-        if not (directory / name).is_file():
-            raise InvalidInputError(f"{directory}: holds no finished model ({name} is missing)")
+    path = Path(path)
+    for name in () if path.is_file() else (MODEL_FILE, METADATA_FILE):
+        if not (path / name).is_file():
+            raise InvalidInputError(f"{path}: holds no finished model ({name} is missing)")
     try:
-        metadata = json.loads((directory / METADATA_FILE).read_text(encoding="utf-8"))
-        recipe = metadata["config"]
-        extras = {"state_std": recipe.get("state_std", False), "clock": recipe.get("clock", 0)}
-        network = make_network(recipe["network"], **extras)
-        network.load_state_dict(load_file(directory / MODEL_FILE, device="cpu"))
+        file = path if path.is_file() else path / MODEL_FILE
+        recipe = _header(path) if path.is_file() else json.loads((path / METADATA_FILE).read_text("utf-8"))["config"]
+        acting = {name: recipe[name] if name in recipe else _DEFAULTS[name] for name in ACTING}
+        network = make_network(acting["network"], state_std=acting["state_std"], clock=acting["clock"])
+        network.load_state_dict(load_file(file, device="cpu"))  # half precision becomes float32 without rounding
     except Exception as error:  # damaged files fail in json, safetensors or torch
         reason = str(error).strip().splitlines()[0] if str(error).strip() else ""
-        raise InvalidInputError(f"{directory}: cannot be read ({type(error).__name__}: {reason})") from error
-    if not all(torch.isfinite(value).all() for value in network.state_dict().values()):
-        raise InvalidInputError(f"{directory / MODEL_FILE}: holds weights that are not finite")
-    return network, metadata
+        raise InvalidInputError(f"{path}: cannot be read ({type(error).__name__}: {reason})") from error
+    _check_finite(file, network.state_dict())
+    mode, repeat, correlation = (acting[name] for name in ("control_mode", "action_repeat", "noise_correlation"))
+    if mode not in CONTROL_MODES or not isinstance(repeat, int) or not 1 <= repeat <= HORIZON:
+        raise InvalidInputError(f"{path}: control_mode {mode!r} or action_repeat {repeat!r} is unusable")
+    if not isinstance(correlation, int | float) or not 0 <= correlation <= 1:
+        raise InvalidInputError(f"{path}: noise_correlation {correlation!r} is unusable")
+    return network, acting
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """What a file of weights says about itself."""
+    with safe_open(path, "pt") as file:
+        found = (file.metadata() or {}).get(_HEADER)
+    if found is None:
+        raise InvalidInputError("its header names no network; give the model's directory, or export it again")
+    return json.loads(found)
+
+
+def _check_finite(path: Path, weights: Mapping[str, torch.Tensor]) -> None:
+    if not all(torch.isfinite(value).all() for value in weights.values()):
+        raise InvalidInputError(f"{path}: holds weights that are not finite")

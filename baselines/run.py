@@ -14,148 +14,49 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import tyro
 
 from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.cli.progress import Progress
-from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
+from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.episodes import check_salt
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.jobs import Job, JobRunner
-from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline, list_baselines
+from tslam_bench.evaluation.policies import get_baseline
+from tslam_bench.evaluation.weights import METADATA_FILE, shipped_seeds, shipped_weights
 from tslam_bench.objects.splits import known_names
 from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.reconstruction.registry import get_reconstructor
 from tslam_bench.scoring.submission import INFO_FILE
 
-from .training_config import PAPER_STEPS
+from .presets import PRESETS, RunSettings
 
 _ONE_PROCESS: Final = ("--processes", "1")
 """Jobs run side by side, so each simulates in one process."""
 _TEST_ASSETS: Final = "assets-test"
 """Job that prepares the test objects and the hand."""
-ALL_BASELINES: Final = tuple(spec.id for spec in list_baselines())
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """What a run does; :data:`PRESETS` has the usual ones.
-
-    Attributes:
-        name: folder below the output folder, and label.
-        objects: test objects; empty: the whole test split.
-        object_set: ranking that the submissions are for.
-        baselines: policies: ids, or ``module:Class``.
-        seeds: repetitions of every episode.
-        steps: training steps of each learned baseline.
-        training: further arguments of ``tslam-bench baselines train``.
-        learning_objects: (split, names) of the objects to learn from; no names: the split's default set, whole. The
-            reconstructors' thresholds are fixed on val, or on train while val is not listed.
-        reconstructors: ids; learned ones are trained first.
-        reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
-        remark: shown beside the figures of learned baselines.
-        policy_salt: where explorers' random numbers and the order of episodes come from. Ours do not look at it, so it is fixed:
-            a run gives the same figures everywhere.
-    """
-
-    name: str
-    objects: tuple[str, ...]
-    object_set: Literal["quick", "test"]
-    baselines: tuple[str, ...]
-    seeds: tuple[int, ...]
-    steps: int
-    training: tuple[str, ...]
-    learning_objects: tuple[tuple[str, tuple[str, ...]], ...]
-    reconstructors: tuple[str, ...]
-    reconstruction_training: tuple[str, ...]
-    remark: str
-    policy_salt: str = "2021"
-
-
-_QUICK_TRAINING: Final = (
-    "--num-envs",
-    "8",
-    "--batch-size",
-    "100",
-    "--checkpoint-every",
-    "8000",
-    "--torch-threads",
-    "1",
-)
-PRESETS: Final[dict[str, RunSettings]] = {
-    "quick": RunSettings(
-        name="quick",
-        objects=QUICK_OBJECTS,
-        object_set="quick",
-        baselines=ALL_BASELINES,
-        seeds=(0,),
-        steps=32_000,
-        training=_QUICK_TRAINING,
-        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
-        reconstruction_training=("--steps", "300"),
-        remark="proves the path, not the method",
-    ),
-    "tiny": RunSettings(
-        name="tiny",
-        objects=("mug",),
-        object_set="quick",
-        baselines=("random", "heuristic", "tslam", "oracle", "nothing"),
-        seeds=(0,),
-        steps=800,
-        training=("--num-envs", "2", "--batch-size", "50", "--epochs", "1", "--torch-threads", "1"),
-        learning_objects=(("train", QUICK_TRAIN_OBJECTS[:2]),),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
-        reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
-        remark="shows that everything runs, nothing else",
-    ),
-    "scripted": RunSettings(
-        name="scripted",
-        objects=(),
-        object_set="test",
-        baselines=("random", "random_targets", "heuristic", "oracle", "nothing"),
-        seeds=(0, 1, 2),
-        steps=0,
-        training=(),
-        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
-        reconstruction_training=("--steps", "1000"),
-        remark="",
-    ),
-    "full": RunSettings(
-        name="full",
-        objects=(),
-        object_set="test",
-        baselines=ALL_BASELINES,
-        seeds=(0, 1, 2),
-        steps=PAPER_STEPS,
-        training=(),
-        learning_objects=(("train", ()), ("val", ())),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
-        reconstruction_training=("--steps", "20000", "--batch-size", "16", "--points", "2048"),
-        remark="",
-    ),
-}
-"""``quick``: a leaderboard within 15 minutes on 2 cores. ``tiny``: the same path in a minute or two, for CI. ``scripted``: what
-needs no policy to be trained, on all test objects, three seeds. ``full``: everything, with the paper's budget; days on a CPU."""
+_SHIPPED: Final = "shipped"
+"""Folder, inside that of a run that trains too, of what shipped weights did."""
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Runs the whole benchmark: assets, training, episodes, reconstruction, scores and page.
 
-    Choose one of --quick, --tiny, --scripted and --full; the other flags change it. Run the same command again to go on after
-    a stop; what is there is reused.
+    Choose one of --quick, --tiny, --scripted, --shipped and --full; the other flags change it. Run the same command again to go
+    on after a stop; what is there is reused.
     """
 
     quick: bool = False
-    """Five objects, all baselines, 32,000 training steps: 15 minutes on 2 cores."""
+    """Five objects, all baselines after 32,000 training steps, and those whose weights are shipped: 15 minutes on 2 cores."""
     tiny: bool = False
     """One object, five explorers, hardly any training: checks that the path works."""
     scripted: bool = False
     """The whole test split, three seeds, the explorers that are not trained: about an hour on 2 cores."""
+    shipped: bool = False
+    """The same, and the learned policies whose weights are shipped: only reconstructors are trained."""
     full: bool = False
     """The whole test split, three seeds, the paper's training budget: days on a CPU."""
     objects: tuple[str, ...] | None = None
@@ -186,7 +87,7 @@ def settings_of(arguments: Arguments) -> RunSettings:
     """
     chosen = [name for name in PRESETS if getattr(arguments, name)]
     if len(chosen) != 1:
-        raise InvalidInputError("choose one of --quick, --tiny, --scripted and --full (--help tells more)")
+        raise InvalidInputError("choose one of --quick, --tiny, --scripted, --shipped and --full (--help tells more)")
     changes = {
         name: getattr(arguments, name)
         for name in ("objects", "baselines", "seeds", "steps", "reconstructors", "policy_salt")
@@ -198,7 +99,14 @@ def settings_of(arguments: Arguments) -> RunSettings:
     settings = replace(PRESETS[chosen[0]], **changes)
     check_salt(settings.policy_salt)
     for baseline in settings.baselines:
-        get_baseline(baseline)
+        spec = get_baseline(baseline)
+        if spec.kind == "learned" and spec.id != baseline:
+            raise InvalidInputError(f"--baselines {baseline}: give the id alone, and --seeds for seeds of the training")
+        if spec.kind == "learned" and "baselines" in changes and not settings.steps:
+            if not settings.shipped:
+                raise InvalidInputError(f"--baselines {baseline}: --{settings.name} trains nothing; give --steps too")
+            known = [seed for seed in settings.seeds if seed in shipped_seeds(baseline)]
+            shipped_weights(baseline, known[0] if known else settings.seeds[0])
     for reconstructor in settings.reconstructors:
         get_reconstructor(reconstructor)
     unique = {name: tuple(dict.fromkeys(getattr(settings, name))) for name in ("baselines", "reconstructors", "seeds")}
@@ -279,7 +187,7 @@ def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
         command += (*settings.reconstruction_training, "--output", str(model))
         jobs.append(Job(f"train-{name}", command, _learning_assets(settings), (model,)))
     for name in settings.baselines:
-        if get_baseline(name).kind == "learned":
+        if get_baseline(name).kind == "learned" and settings.steps:
             folder = output / "models" / name
             command = ("tslam-bench", "baselines", "train", name, "--steps", str(settings.steps))
             command += (
@@ -299,41 +207,58 @@ def _reconstructors(settings: RunSettings, baseline: str) -> Command:
 
 
 def _evaluations(settings: RunSettings, output: Path) -> list[Job]:
-    models = _models(settings, output)
     jobs = []
     for name in settings.baselines:
         spec = get_baseline(name)
-        chosen = _reconstructors(settings, name)
-        specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
-        command: Command = ("tslam-bench", "evaluate", "--policy", name, "--object-set", settings.object_set)
-        command += (*_objects(settings), "--seeds", *map(str, settings.seeds))
-        if spec.kind != "reference":
-            command += ("--policy-salt", settings.policy_salt)
-        command += ("--reconstructor", *specifications, *_ONE_PROCESS, "--output", str(output))
-        after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
-        if any(get_reconstructor(r).needs == "objects" for r in chosen):
-            after.append("assets-train")
-            command += _listed("--learning-objects", dict(settings.learning_objects)["train"])
-        if spec.kind == "learned":
+        if spec.kind != "learned":
+            jobs.append(_evaluation(settings, output, output, name, settings.seeds, ()))
+        elif settings.steps:
             label = f"{settings.name}: {settings.steps:,} steps" + (f", {settings.remark}" if settings.remark else "")
-            command += ("--model", str(output / "models" / name), "--label", label)
-            after.append(f"train-{name}")
-        outputs = tuple(output / "submissions" / f"{spec.id}-{get_reconstructor(r).id}" / INFO_FILE for r in chosen)
-        jobs.append(Job(f"evaluate-{spec.id}", command, tuple(after), outputs))
+            more = ("--model", str(output / "models" / name), "--label", label)
+            trained = _evaluation(settings, output, output, name, settings.seeds, more)
+            jobs.append(replace(trained, after=(*trained.after, f"train-{name}")))
+    if settings.shipped:
+        for name in settings.baselines:
+            seeds = [seed for seed in settings.seeds if seed in shipped_seeds(name)]
+            if seeds:  # always: whether the weights are still the same is for the command to find out
+                job = _evaluation(settings, output, output / _SHIPPED if settings.steps else output, name, seeds, ())
+                jobs.append(replace(job, name=f"evaluate-{_SHIPPED}-{name}", always=True))
     return jobs
+
+
+def _evaluation(
+    settings: RunSettings, output: Path, folder: Path, name: str, seeds: Sequence[int], more: Command
+) -> Job:
+    """Evaluates one policy into ``folder``."""
+    models, spec, chosen = _models(settings, output), get_baseline(name), _reconstructors(settings, name)
+    specifications = [f"{r}={models[r]}" if r in models else r for r in chosen]
+    command: Command = ("tslam-bench", "evaluate", "--policy", name, "--object-set", settings.object_set)
+    command += (*_objects(settings), "--seeds", *map(str, seeds))
+    if spec.kind != "reference":
+        command += ("--policy-salt", settings.policy_salt)
+    command += ("--reconstructor", *specifications, *_ONE_PROCESS, "--output", str(folder))
+    after = [_TEST_ASSETS, *(f"train-{r}" for r in chosen if r in models)]
+    if any(get_reconstructor(r).needs == "objects" for r in chosen):
+        after.append("assets-train")
+        command += _listed("--learning-objects", dict(settings.learning_objects)["train"])
+    outputs = tuple(folder / "submissions" / f"{spec.id}-{get_reconstructor(r).id}" / INFO_FILE for r in chosen)
+    return Job(f"evaluate-{spec.id}", (*command, *more), tuple(after), outputs)
 
 
 def _scoring_jobs(settings: RunSettings, output: Path, evaluations: Sequence[Job], workers: int) -> list[Job]:
     jobs = []
-    folder = output / "scores"
+    shipped: Command = ()
     for evaluation in evaluations:
         submissions = [path.parent for path in evaluation.outputs]
+        run = submissions[0].parents[1]
+        folder = run / "scores"
+        shipped = shipped if run == output else (str(run),)
         files = tuple(folder / f"{submission.name}.json" for submission in submissions)
         command: Command = ("tslam-bench", "score", *map(str, submissions), *_objects(settings))
         command += ("--output", str(folder if len(files) > 1 else files[0]))
         jobs.append(Job(evaluation.name.replace("evaluate", "score"), command, (evaluation.name,), files))
     page = (output / "leaderboard.json", output / "index.html")
-    command = ("tslam-bench", "leaderboard", "--scores", str(folder), "--output", str(output))
+    command = ("tslam-bench", "leaderboard", *shipped, "--scores", str(output / "scores"), "--output", str(output))
     command += ("--workers", str(workers))
     return [*jobs, Job("leaderboard", command, tuple(job.name for job in jobs), page, slots=workers)]
 
@@ -345,6 +270,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with one_line_errors("run"):
         settings = settings_of(parsed)
         output = parsed.output or Path("runs") / settings.name
+        absent = [
+            name for name in settings.baselines if get_baseline(name).kind == "learned" and not shipped_seeds(name)
+        ]
+        if settings.shipped and absent:
+            print(f"run: no weights are shipped of {', '.join(absent)}", file=sys.stderr)
         _run(plan(settings, output, parsed.workers), output, parsed.workers, parsed.dry_run)
 
 

@@ -6,14 +6,16 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 for argument in "$@"; do
     if [ "$argument" = "-h" ] || [ "$argument" = "--help" ]; then
         cat <<'USAGE'
-usage: bash baselines/run_all.sh --quick | --tiny | --scripted | --full [options]
+usage: bash baselines/run_all.sh --quick | --tiny | --scripted | --shipped | --full [options]
 
 Does its own set-up (virtual environment, dependencies, assets), prints the commands it runs, and leaves
 runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run it again to go on after a stop.
 
-  --quick                five objects, all baselines, a few thousand training steps: 15 minutes on 2 cores
+  --quick                five objects, all baselines after a few thousand training steps, and those whose weights are
+                         shipped: 15 minutes on 2 cores
   --tiny                 one object, five explorers, hardly any training: checks that the path works
   --scripted             the whole test split, three seeds, explorers that are not trained: about an hour on 2 cores
+  --shipped              the same and the learned policies whose weights are shipped, each seed with its own
   --full                 the whole test split, three seeds, the paper's training budget: days on a CPU
 
   --objects NAME ...     test objects instead of the preset's

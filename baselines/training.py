@@ -27,10 +27,11 @@ from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
 from tslam_bench.engine.gpu_physics import simulation_device
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE, get_baseline
+from tslam_bench.evaluation.policies import get_baseline
+from tslam_bench.evaluation.weights import METADATA_FILE
 from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
 from tslam_bench.hand_constants import ARM_JOINTS, JOINT_NAMES
-from tslam_bench.machine import processor_name
+from tslam_bench.machine import processor_name, source_commit
 from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.registration import make_vec
 from tslam_bench.version import __version__
@@ -116,6 +117,7 @@ def train(config: TrainingConfig, output: Path, command: str = "", on_progress: 
         "seconds": round(log.seconds, 1),
         "mean_return": log.mean_return,
         "machine": machine_description(),
+        "commit": source_commit(),
         "versions": {
             "tslam_bench": __version__,
             "torch": str(torch.__version__),

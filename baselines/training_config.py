@@ -100,6 +100,10 @@ class TrainingConfig:
         spec = get_baseline(self.baseline)
         if spec.kind != "learned":
             raise InvalidInputError(f"baseline {self.baseline!r}: is {spec.kind}, there is nothing to train")
+        if spec.id != self.baseline:
+            raise InvalidInputError(
+                f"baseline {self.baseline!r}: give the id alone; --seed is the seed of the training"
+            )
         for name in (
             *("steps", "num_envs", "rollout_steps", "action_repeat", "batch_size", "epochs"),
             *("checkpoint_every", "reconfigure_every", "torch_threads"),

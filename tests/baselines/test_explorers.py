@@ -20,8 +20,9 @@ from tslam_bench.baselines.network import NETWORKS, PolicyNetwork
 from tslam_bench.baselines.random_actions import RandomBaseline, RandomTargetsBaseline
 from tslam_bench.constants import GRID_SIZE, HORIZON, NUM_JOINTS, PRIVILEGED_REWARD_MODES, REWARD_MODES
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE, get_baseline, list_baselines, make_baseline
+from tslam_bench.evaluation.policies import get_baseline, list_baselines, make_baseline
 from tslam_bench.evaluation.policy import Policy, episode_generators
+from tslam_bench.evaluation.weights import METADATA_FILE, MODEL_FILE, WEIGHTS_VARIABLE
 from tslam_bench.hand_constants import DELTA_STEP, JOINT_LIMITS, JOINT_NAMES, SKIN_LINKS, START_ARM_HIGH
 
 
@@ -94,7 +95,8 @@ def test_unknown_id_lists_the_known_ones() -> None:
     assert all(spec.id in message for spec in list_baselines())
 
 
-def test_make_baseline_refuses_what_has_no_policy_or_no_model(tmp_path) -> None:
+def test_make_baseline_refuses_what_has_no_policy_or_no_model(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
     with pytest.raises(InvalidInputError, match="no policy"):
         make_baseline("oracle")
     with pytest.raises(InvalidInputError, match="tslam-bench baselines train tslam_knn"):

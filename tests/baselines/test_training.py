@@ -22,7 +22,8 @@ from tslam_bench.constants import HORIZON
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.evaluate import EvaluationConfig, evaluate, make_reconstructors
-from tslam_bench.evaluation.policies import MODEL_FILE, make_baseline
+from tslam_bench.evaluation.policies import make_baseline
+from tslam_bench.evaluation.weights import MODEL_FILE
 from tslam_bench.files import CACHE_VARIABLE
 from tslam_bench.hand_constants import SKIN_LINKS
 from tslam_bench.scoring.submission import read_submission

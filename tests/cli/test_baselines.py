@@ -10,6 +10,7 @@ import pytest
 
 from tslam_bench import cli
 from tslam_bench.evaluation.policies import list_baselines
+from tslam_bench.evaluation.weights import WEIGHTS_VARIABLE
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,6 +44,9 @@ def test_list_as_table_and_json(capsys) -> None:
         (("baselines", "train", "random"), "nothing to train"),
         (("baselines", "train", "tslam", "--split", "test"), "train split only"),
         (("baselines", "train", "tslam", "--steps", "0"), "steps 0"),
+        (("baselines", "train", "tslam@1"), "give the id alone"),
+        (("baselines", "export", "nowhere", "--output", "weights"), "nowhere: is no directory of a trained model"),
+        (("evaluate", "--policy", "random@1", "--objects", "mug"), "only a learned explorer has one"),
         (("evaluate", "--policy", "nope"), "'nope': unknown"),
         (("evaluate", "--policy", "random", "--objects", "mugg"), "mug"),
         (("evaluate", "--policy", "random", "--objects", "mug", "--seeds", "1", "1"), "different"),
@@ -57,7 +61,8 @@ def test_bad_input_is_one_line_and_status_2(capsys, arguments, message: str, tmp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_model_names_the_training_command(capsys, tmp_path) -> None:
+def test_missing_model_names_the_training_command(capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
     status, _, errors = run(
         capsys,
         *("evaluate", "--policy", "tslam", "--objects", "mug", "--reconstructor", "grid"),

@@ -27,8 +27,8 @@ from tslam_bench.constants import ENVIRONMENT_ID, GRID_SIZE, NUM_POSES
 from tslam_bench.episodes import check_salt, new_salt, shuffled
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import (
-    METADATA_FILE,
     PolicySpec,
+    fixed_model,
     get_baseline,
     make_baseline,
     policy_label,
@@ -36,6 +36,7 @@ from tslam_bench.evaluation.policies import (
 )
 from tslam_bench.evaluation.policy import CheckedPolicy
 from tslam_bench.evaluation.rollouts import roll_out_batch
+from tslam_bench.evaluation.weights import shipped_weights, training_record
 from tslam_bench.files import ensure_writable_directory, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import CONTROL_MODES
@@ -72,7 +73,8 @@ class EvaluationConfig:
         objects: objects of the test split; aliases are resolved.
         seeds: repetitions; each is 8 episodes per object.
         object_set: ``quick`` or ``test``: which ranking the submissions are for.
-        model: directory of the trained model of a learned baseline, or what a policy of the user's reads.
+        model: directory of the trained model of a learned baseline, or a file of weights; or what a policy of the user's
+            reads. None lets a learned baseline play repetition s with the shipped weights of training seed s.
         arguments: handed to the policy's class or function.
         policy_salt: hexadecimal digits from which the explorer's random numbers and the order of the episodes come; None
             takes that of the episodes which are there already, or draws one.
@@ -201,12 +203,14 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
     Raises:
         InvalidInputError: ``folder`` holds episodes of another model, of other code, of other assets or of another salt.
     """
-    made = make_baseline(config.policy, config.model, **config.arguments)
-    baseline = CheckedPolicy(made, policy_label(config.policy))
+    players = _players(config)
+    modes = sorted({baseline.control_mode for baseline in players.values()})
+    if len(modes) > 1:
+        raise InvalidInputError(f"policy {config.spec.id!r}: its weights act in {' and in '.join(modes)}; evaluate one")
     path = ensure_writable_directory(folder) / SOURCE_FILE
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     salt = config.policy_salt or known.get("policy_salt") or new_salt()
-    source = _source(config, baseline.control_mode, salt)
+    source = _source(config, modes[0], salt)
     _record_source(path, source, f"{folder}: holds other episodes", bool(known))
     episodes = [(name, pose, seed) for name, seed in _repetitions(config) for pose in range(NUM_POSES)]
     missing = [e for e in shuffled(salt, episodes) if not (folder / rollout_file(*e)).is_file()]
@@ -220,19 +224,32 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
         "cpu",
         objects=config.objects,
         split="test",
-        control_mode=baseline.control_mode,
+        control_mode=modes[0],
         processes=config.processes,
     )
     try:
-        for first in range(0, len(missing), width):
-            baseline.playing = missing[first : first + width]
-            for rollout in roll_out_batch(envs, baseline, missing[first : first + width], salt):
-                rollout.save(folder)
-                done += 1
-                report("explore", done, len(episodes))
+        for seeds, baseline in players.items():
+            its = [episode for episode in missing if episode[2] in seeds]
+            for first in range(0, len(its), width):
+                baseline.playing = its[first : first + width]
+                for rollout in roll_out_batch(envs, baseline, baseline.playing, salt):
+                    rollout.save(folder)
+                    done += 1
+                    report("explore", done, len(episodes))
     finally:
         envs.close()
     return source
+
+
+def _players(config: EvaluationConfig) -> dict[tuple[int, ...], CheckedPolicy]:
+    """Repetitions -> the policy that plays them: one plays all, but shipped weights play the repetition of their seed."""
+    label = policy_label(config.policy)
+    if config.spec.kind != "learned" or fixed_model(config.spec, config.model, config.arguments) is not None:
+        return {config.seeds: CheckedPolicy(make_baseline(config.policy, config.model, **config.arguments), label)}
+    return {
+        (seed,): CheckedPolicy(make_baseline(config.policy, **config.arguments, seed=seed), label)
+        for seed in config.seeds
+    }
 
 
 def merged_grids(rollouts: Sequence[Rollout]) -> Grids:
@@ -272,17 +289,22 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
     ``source`` is what :func:`explore` returned, empty for a reference.
     """
     spec = config.spec
-    training = Training()
-    if spec.kind == "learned" and config.model is not None:
-        metadata = _model_metadata(config.model)
-        machine = metadata["machine"]
-        training = Training(
-            steps=int(metadata["steps"]),
-            wall_time_hours=float(metadata["seconds"]) / 3600,
+    training, label, name = Training(), config.label, spec.id
+    if spec.kind == "learned":
+        fixed = fixed_model(spec, config.model, config.arguments)
+        models = [fixed] if fixed is not None else [shipped_weights(spec.id, seed) for seed in config.seeds]
+        records = [training_record(model) for model in models]
+        machine = records[0]["machine"]
+        training = Training(  # of several trainings, the longest
+            steps=max(int(record["steps"]) for record in records),
+            wall_time_hours=max(float(record["seconds"]) for record in records) / 3600,
             hardware=f"{machine['processor']}, {machine['cores']} cores",
         )
+        name = spec.reference or name
+        if config.model is None and not label:
+            label = f"shipped weights: {training.steps:,} training steps"
     return SubmissionInfo(
-        method=f"{_with_arguments(spec.id, config.arguments)} + {reconstructor}",
+        method=f"{_with_arguments(name, config.arguments)} + {reconstructor}",
         explorer=spec.id,
         reconstructor=reconstructor,
         authors=config.authors,
@@ -295,7 +317,7 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
         control_mode=source.get("control_mode", CONTROL_MODES[0]),
         policy_salt=source.get("policy_salt"),
         training=training,
-        label=config.label,
+        label=label,
     )
 
 
@@ -327,10 +349,6 @@ def _add_object(
 
 def _repetitions(config: EvaluationConfig) -> Iterator[tuple[str, int]]:
     return ((name, seed) for name in config.objects for seed in config.seeds)
-
-
-def _model_metadata(model: Path) -> dict[str, Any]:
-    return json.loads((model / METADATA_FILE).read_text(encoding="utf-8"))
 
 
 def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str, Any]:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from tslam_bench.constants import PRIVILEGED_EXPLORERS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.policy import Policy
+from tslam_bench.evaluation.weights import shipped_seeds, shipped_weights, weights_file
+from tslam_bench.files import sha256_file
 from tslam_bench.hand_constants import CONTROL_MODES
 from tslam_bench.plugins import Registry, Spec
-
-MODEL_FILE: Final = "model.safetensors"
-"""A finished model's weights: numbers alone, so that a stranger's model cannot run code."""
-METADATA_FILE: Final = "model.json"
-"""Written last: a model directory without it is unfinished."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +108,20 @@ def list_baselines() -> tuple[PolicySpec, ...]:
 def get_baseline(policy: Any) -> PolicySpec:
     """The spec of an id, of ``module:Class``, of a class or function, or of a policy itself.
 
+    ``tslam@1`` is ``tslam`` with the shipped weights of training seed 1.
+
     Raises:
-        InvalidInputError: unknown id (the message lists the known ones).
+        InvalidInputError: unknown id (the message lists the known ones), or ``@`` after one that is not learned.
     """
-    return _POLICIES.get(policy)
+    if not isinstance(policy, str) or "@" not in policy or ":" in policy:
+        return _POLICIES.get(policy)
+    name, _, seed = policy.partition("@")
+    spec = _POLICIES.get(name)
+    if spec.kind != "learned" or not (seed.isascii() and seed.isdigit()):
+        raise InvalidInputError(
+            f"policy {policy!r}: a training seed follows '@', as in tslam@1, and only a learned explorer has one"
+        )
+    return replace(spec, kwargs={**spec.kwargs, "seed": int(seed)}, reference=policy)
 
 
 def make_baseline(policy: Any, model: Path | None = None, /, **arguments: Any) -> Policy:
@@ -122,10 +129,10 @@ def make_baseline(policy: Any, model: Path | None = None, /, **arguments: Any) -
 
     Args:
         policy: see :func:`get_baseline`.
-        model: of a learned explorer, the directory that ``tslam-bench baselines train`` wrote; of a policy of the user's,
-            whatever it reads.
-        arguments: handed to its class or function. Learned explorers take ``deterministic``: act by the mean of the policy
-            instead of sampling from it.
+        model: of a learned explorer, the directory that ``tslam-bench baselines train`` wrote, or a file of weights; None
+            loads the shipped weights. Of a policy of the user's, whatever it reads.
+        arguments: handed to its class or function. Learned explorers take ``seed``, that of the training whose shipped
+            weights are loaded (default 0), and ``deterministic``: act by the mean of the policy instead of sampling from it.
 
     Raises:
         InvalidInputError: unknown id, a reference (it has no policy), something that is not a policy, unknown
@@ -145,10 +152,29 @@ def make_baseline(policy: Any, model: Path | None = None, /, **arguments: Any) -
 
 
 def policy_source(policy: Any, arguments: dict[str, Any], model: Path | None) -> dict[str, Any]:
-    """What the episodes of a policy depend on: see :meth:`tslam_bench.plugins.Registry.source`."""
+    """What the episodes of a policy depend on: see :meth:`tslam_bench.plugins.Registry.source`.
+
+    Where each repetition has weights of its own, the hashes of all shipped ones, by training seed.
+    """
     spec = get_baseline(policy)
-    file = model / MODEL_FILE if model is not None and spec.kind == "learned" else model
-    return _POLICIES.source(spec, arguments, file)
+    if spec.kind != "learned":
+        return _POLICIES.source(spec, arguments, model)
+    fixed = fixed_model(spec, model, arguments)
+    source = _POLICIES.source(spec, arguments, None if fixed is None else weights_file(fixed))
+    if fixed is None:
+        seeds = shipped_seeds(spec.id)
+        source["model_sha256"] = {str(seed): sha256_file(shipped_weights(spec.id, seed)) for seed in seeds}
+    return source
+
+
+def fixed_model(spec: PolicySpec, model: Path | None, arguments: Mapping[str, Any]) -> Path | None:
+    """The model that a learned explorer plays every repetition with; None: each with the weights of its own training seed.
+
+    Raises:
+        InvalidInputError: a training seed is named whose weights are not shipped.
+    """
+    seed = spec.kwargs.get("seed", arguments.get("seed"))
+    return model if model is not None or seed is None else shipped_weights(spec.id, seed)
 
 
 def policy_label(policy: Any) -> str:

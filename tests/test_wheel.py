@@ -63,6 +63,7 @@ def test_the_wheel_holds_every_module_and_nothing_with_a_generic_name(wheel: Pat
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".jinja", ".css", ".js", ".sh", ".typed") or path.parent.name == "weights":
                 assert inside + path.relative_to(ROOT).as_posix() in names
+    assert "tslam_bench/assets/constraints.txt" in names
     for split in ("test", "train", "val"):
         assert f"tslam_bench/assets/manifest_{split}.json" in names
 
@@ -99,6 +100,10 @@ def test_the_core_scores_without_simulator_and_torch(wheel: Path, tmp_path: Path
     command = tmp_path / "venv" / "bin" / "tslam-bench"
     run(command, "leaderboard", "balls", "--output", "page", folder=tmp_path)
     assert (tmp_path / "page" / "index.html").stat().st_size > 10_000
+    done = subprocess.run([command, "doctor", "--no-probe"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stdout + done.stderr and done.returncode == 0, done.stdout
+    assert "core     " in done.stdout and "-> pip install 'tslam-bench[sim]'" in done.stdout
+    assert "this machine can: score submissions\n" in done.stdout
     for arguments in (["evaluate", "--policy", "random"], ["assets", "prepare", "--hand"]):
         done = subprocess.run([command, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 2 and "pip install 'tslam-bench[" in done.stderr

@@ -1,6 +1,7 @@
 """Optional dependencies: which extra brings a package that is missing.
 
-The core scores and builds pages; ``tslam-bench[sim]`` simulates and learns, ``tslam-bench[assets]`` prepares objects.
+The core scores and builds pages; ``tslam-bench[sim]`` simulates and learns, ``tslam-bench[assets]`` prepares objects,
+``tslam-bench[ray]`` and ``tslam-bench[slurm]`` run jobs on several machines.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from tslam_bench.errors import MissingPackageError
 EXTRAS: Final = {
     "assets": ("coacd", "collada", "lxml", "manifold3d", "mujoco", "networkx", "rtree", "skimage"),
     "sim": ("mani_skill", "safetensors", "sapien", "stable_baselines3", "tensorboard", "torch"),
+    "ray": ("ray",),
+    "slurm": ("submitit",),
 }
 """Extra -> the modules that it brings."""
 

@@ -204,7 +204,8 @@ def test_without_a_gpu_the_command_says_so_in_one_line(capsys):
         main(["gpu-check", "--num-envs", "4"])
     assert ended.value.code == 2
     assert capsys.readouterr().err == (
-        "tslam-bench: gpu-check: there is no CUDA GPU that torch can use; run it on a machine that has one\n"
+        "tslam-bench: gpu-check: there is no CUDA GPU that torch can use; run it on a machine that has one; "
+        "tslam-bench doctor tells what is found here\n"
     )
 
 

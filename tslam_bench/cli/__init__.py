@@ -20,6 +20,7 @@ _COMMANDS = {
     "score": ("tslam_bench.cli.score", "score_main", "score submissions: a table and JSON"),
     "leaderboard": ("tslam_bench.leaderboard.commands", "page_main", "rank scored submissions and build the page"),
     "gpu-check": ("tslam_bench.cli.gpu_check", "main", "compare the GPU simulation with the CPU's"),
+    "doctor": ("tslam_bench.cli.doctor", "main", "tell what this machine can do, what is missing, and how fast it is"),
 }
 """Word -> module, function and summary: nothing is imported before its word is given."""
 

@@ -160,7 +160,8 @@ def _video(command: Video) -> None:
     check_output(command.output)
     if not vulkan_device_available():
         raise AssetError(
-            "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU"
+            "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU "
+            "(tslam-bench doctor tells how)"
         )
     from tslam_bench.evaluation.policies import make_baseline, policy_label
     from tslam_bench.evaluation.policy import CheckedPolicy

@@ -51,7 +51,10 @@ def main(arguments: Sequence[str]) -> None:
     from tslam_bench.evaluation.gpu_check import Episodes, Finding, compare, judge, record
 
     if not gpu_physics.cuda_available():
-        raise InvalidInputError("gpu-check: there is no CUDA GPU that torch can use; run it on a machine that has one")
+        raise InvalidInputError(
+            "gpu-check: there is no CUDA GPU that torch can use; run it on a machine that has one; "
+            "tslam-bench doctor tells what is found here"
+        )
     gpu_physics.enable_gpu_physics()  # before the capture, which would hide what fails here
     episodes = Episodes.draw(command.objects, variant.poses, command.num_envs, command.seed)
 

@@ -42,7 +42,9 @@ def simulation_device(device: str, environment_id: str) -> str:
     if device not in DEVICES:
         raise InvalidInputError(f"device {device!r}: unknown; choose one of {', '.join(DEVICES)}")
     if device == "cuda" and not cuda_available():
-        raise InvalidInputError("device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto")
+        raise InvalidInputError(
+            "device 'cuda': there is no CUDA GPU that torch can use; choose cpu or auto (see: tslam-bench doctor)"
+        )
     trusted = device == "auto" and cuda_available() and gpu_check_passed(environment_id)
     return "cuda" if device == "cuda" or trusted else "cpu"
 

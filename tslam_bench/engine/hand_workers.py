@@ -184,7 +184,8 @@ class HandWorkers:
                     process.join(5)
                     self.stop()
                     raise WorkerError(
-                        f"worker {key.data}: died (exit code {process.exitcode}); all workers were stopped, {remedy}"
+                        f"worker {key.data}: died (exit code {process.exitcode}); all workers were stopped, {remedy}; "
+                        "tslam-bench doctor tells whether memory or a library is missing"
                     ) from None
                 if kind == "error":
                     self.stop()

@@ -35,16 +35,25 @@ _MOST_RIVALS: Final = 1000
 
 
 def cache_directory() -> Path:
-    """The user cache directory (not created): ``$TSLAM_BENCH_CACHE``, or the platform's cache folder."""
+    """The user cache directory (not created): ``$TSLAM_BENCH_CACHE``, or the platform's cache folder.
+
+    Raises:
+        AssetError: neither is set, as for a user in a container who is in no list of users.
+    """
     override = os.environ.get(CACHE_VARIABLE)
     if override:
         return Path(override).expanduser().absolute()
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", str(Path.home() / "AppData" / "Local")))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        if sys.platform == "darwin":
+            base = Path.home() / "Library" / "Caches"
+        elif sys.platform == "win32":
+            base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise AssetError(
+            f"this user has no home directory; set {CACHE_VARIABLE} to a directory that you can write"
+        ) from error
     return base / "tslam_bench"
 
 

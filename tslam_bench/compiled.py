@@ -8,6 +8,7 @@ same bits.
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -46,6 +47,6 @@ def _without_cache() -> Iterator[None]:
 
 
 def _say_once(what: str) -> None:
-    if what not in _said:
+    if what not in _said and multiprocessing.parent_process() is None:  # or each worker would repeat it
         _said.add(what)
-        warnings.warn(f"{what}; functions are compiled anew in each process", stacklevel=3)
+        warnings.warn(f"{what}; functions are compiled anew in each process", stacklevel=1)

@@ -235,9 +235,8 @@ def _locked(path: Path) -> Iterator[int | None]:
             folder = path.parent.parent
             raise InvalidInputError(f"{folder}: another run uses this folder; wait for it or choose another") from None
         except OSError as error:  # many network file systems
-            warnings.warn(
-                f"{path}: cannot be locked ({error.strerror}); start no second run in this folder", stacklevel=2
-            )
+            reason = f"cannot be locked ({error.strerror})"
+            warnings.warn(f"{path.parent.parent}: {reason}; start no second run in this folder", stacklevel=1)
             yield None
             return
         yield stream.fileno()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.policies import METADATA_FILE, MODEL_FILE
@@ -44,7 +44,7 @@ def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, 
     """Writes a finished model; ``model.json`` comes last."""
     weights = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     with atomic_file(directory / MODEL_FILE) as temporary:
-        save_file(weights, temporary)
+        temporary.write_bytes(save(weights))
     write_json(directory / METADATA_FILE, metadata)
 
 

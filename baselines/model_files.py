@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save, save_file
+from safetensors.torch import load_file, save
 
 from tslam_bench.constants import HORIZON
 from tslam_bench.errors import InvalidInputError
@@ -54,7 +54,7 @@ def write_model(directory: Path, network: PolicyNetwork, metadata: Mapping[str, 
     """Writes a finished model; ``model.json`` comes last."""
     weights = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     with atomic_file(directory / MODEL_FILE) as temporary:
-        save_file(weights, temporary)
+        temporary.write_bytes(save(weights))
     write_json(directory / METADATA_FILE, metadata)
 
 

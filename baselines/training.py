@@ -8,6 +8,7 @@ weights, bit for bit, as one that was not.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import platform
@@ -21,15 +22,15 @@ from typing import Any, Final
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from torch.utils.tensorboard import SummaryWriter
 
 from tslam_bench.constants import ENVIRONMENT_ID, NUM_JOINTS
+from tslam_bench.curves import Curves
 from tslam_bench.engine.gpu_physics import simulation_device
 from tslam_bench.engine.rewards import COVERAGE_WEIGHT
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.evaluation.policies import get_baseline
 from tslam_bench.evaluation.weights import METADATA_FILE
-from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json
+from tslam_bench.files import atomic_directory, ensure_writable_directory, write_json, writing
 from tslam_bench.hand_constants import ARM_JOINTS, JOINT_NAMES
 from tslam_bench.machine import processor_name, source_commit
 from tslam_bench.objects.store import asset_sha256, list_objects
@@ -179,8 +180,9 @@ class _Log:
         self._curve = output / CURVE_FILE
         lines = self._curve.read_text(encoding="utf-8").splitlines() if self._curve.is_file() else []
         done = [line for line in lines if line.endswith("}") and json.loads(line)["steps"] <= learner.steps]
-        self._curve.write_text("".join(f"{line}\n" for line in done), encoding="utf-8")
-        self._writer = SummaryWriter(str(output / "tensorboard"), purge_step=learner.steps + 1)
+        with writing(self._curve):
+            self._curve.write_text("".join(f"{line}\n" for line in done), encoding="utf-8")
+        self._writer = Curves(output / "tensorboard", learner.steps + 1)
 
     def __enter__(self) -> _Log:
         return self
@@ -212,9 +214,9 @@ class _Log:
             figures[f"time/{stage}_seconds"] = seconds
         self._last, self.figures = now, figures
         for name, value in figures.items():
-            self._writer.add_scalar(name, value, self._learner.steps)
+            self._writer.add(name, value, self._learner.steps)
         rounded = {name: round(value, 5) for name, value in figures.items()}
-        with self._curve.open("a", encoding="utf-8") as file:
+        with writing(self._curve), self._curve.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"steps": self._learner.steps, **rounded}) + "\n")
 
 
@@ -234,7 +236,9 @@ def _save_checkpoint(learner: PPO, config: TrainingConfig, assets: dict[str, Any
     """Writes ``checkpoints/<steps>/`` atomically, then removes older ones."""
     target = output / "checkpoints" / f"{learner.steps:010d}"
     with atomic_directory(target) as temporary:
-        torch.save(learner.state(), temporary / CHECKPOINT_TENSORS)
+        tensors = io.BytesIO()  # torch's own writing of a file ends in a library error on a full disk
+        torch.save(learner.state(), tensors)
+        (temporary / CHECKPOINT_TENSORS).write_bytes(tensors.getbuffer())
         state = {
             "config": _plain(config),
             "assets": assets,

@@ -18,12 +18,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from rollouts import KINDS, Hands, make_actor
 from scipy.spatial import ConvexHull
 
 from tslam_bench import grids
+from tslam_bench.compiled import njit
 from tslam_bench.constants import HORIZON, NUM_JOINTS
 from tslam_bench.engine.hand_batch import BatchSettings
 from tslam_bench.engine.link_poses import POSE_SIZE, link_matrices

@@ -9,10 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -32,6 +29,7 @@ from tslam_bench.objects.store import PreparedObject, asset_sha256, load_object
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring.measure import merge_touched_steps
 from tslam_bench.scoring.prediction import invalid_mesh, solid_in_mesh
+from tslam_bench.scoring.scoring import WorkerDied, worker_pool
 from tslam_bench.scoring.submission import EXPLORATION_ORDER, Reconstruction, Submission
 
 PICTURE_SIZE: Final = 232
@@ -107,22 +105,12 @@ def make_pictures(
     # One process draws all of one object: its mesh is loaded once.
     groups = [[p for p in missing if p.object == name] for name in dict.fromkeys(p.object for p in missing)]
     arguments = [([(picture, paths[picture]) for picture in group], cache) for group in groups]
-    if workers <= 1 or len(groups) <= 1:
-        for drawn in map(_draw_group, arguments):
+    # A process that dies leaves its pictures out, and those of the others that wait.
+    with contextlib.suppress(WorkerDied), worker_pool(min(workers, len(groups))) as pool:
+        for drawn in (pool.map if pool else map)(_draw_group, arguments):
             done += drawn
             if on_progress:
                 on_progress(done, len(paths))
-    else:
-        context = multiprocessing.get_context("spawn")
-        # A process that dies leaves its pictures out, and those of the others that wait.
-        with (
-            contextlib.suppress(BrokenProcessPool),
-            ProcessPoolExecutor(min(workers, len(groups)), mp_context=context) as pool,
-        ):
-            for drawn in pool.map(_draw_group, arguments):
-                done += drawn
-                if on_progress:
-                    on_progress(done, len(paths))
     content = {picture: path.read_bytes() for picture, path in paths.items() if path.is_file()}
     return {picture: data for picture, data in content.items() if data}
 

@@ -21,7 +21,7 @@ from tslam_bench.engine.arrays import NumpyBackend, TorchBackend
 from tslam_bench.engine.gpu_memory import gpu_memory
 from tslam_bench.engine.hand_agent import AdroitHand
 from tslam_bench.engine.hand_scene import HandScene
-from tslam_bench.engine.rendering import vulkan_device_available
+from tslam_bench.engine.rendering import OneLineRendering, choose_backend
 from tslam_bench.engine.rewards import Rewards
 from tslam_bench.engine.scene_objects import SceneObjects, register_actor
 from tslam_bench.engine.sensing import Contacts
@@ -42,7 +42,7 @@ SPACING: Final = 2.5
 """Metres between the sub-scenes of a GPU: float32 is the coarser the further out one lies (docs/gpu.md)."""
 
 
-class TactileSLAMEnv(WholeState):
+class TactileSLAMEnv(OneLineRendering, WholeState):
     """A blind 28-DoF hand with binary touch explores a fixed, unknown object for 200 steps (6 s).
 
     **Description.** The object hangs at the workspace centre, a cube W of edge 0.25 m, and does not move. The hand
@@ -90,7 +90,7 @@ class TactileSLAMEnv(WholeState):
 
     Raises:
         InvalidInputError: unknown object, split, pose, reward mode or control mode; an action of wrong shape or not finite.
-        AssetError: an object or the hand is not prepared.
+        AssetError: an object or the hand is not prepared; pictures are observed, or ``render`` is called, without Vulkan.
 
     **Version history.** v0: first version, protocol 1.
     """
@@ -137,9 +137,7 @@ class TactileSLAMEnv(WholeState):
         self.pose: list[int] = [0] * num_envs
         self.faults: Any = 0
         """(E,) int64 on a GPU: control steps since this was made with an action or a hand that was not finite."""
-        if render_backend == "auto":
-            wants_images = render_mode is not None or obs_mode not in ("state_dict", "state", "none")
-            render_backend = "gpu" if wants_images and vulkan_device_available() else "none"
+        render_backend = choose_backend(obs_mode, render_mode, render_backend)
         super().__init__(
             *args,
             num_envs=num_envs,

@@ -12,7 +12,7 @@ LEAVES = ("tasks", "baselines", "leaderboard")
 ENTRY_POINT_GROUPS = ("tslam_bench.policies", "tslam_bench.reconstructors")
 BASE = (
     *("constants", "errors", "files", "grids", "hand_constants"),
-    *("machine", "extras", "episodes", "plugins", "text", "variants", "version"),
+    *("compiled", "curves", "machine", "extras", "episodes", "plugins", "text", "variants", "version"),
 )
 """Modules of the library that lie in no folder and that everything may import."""
 ALLOWED: dict[str, set[str]] = {

@@ -15,7 +15,15 @@ import pytest
 
 from tslam_bench.cli import main
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_directory, ensure_writable_directory, place_to_write, read_plain_file, write_json
+from tslam_bench.files import (
+    CACHE_VARIABLE,
+    atomic_directory,
+    cache_directory,
+    ensure_writable_directory,
+    place_to_write,
+    read_plain_file,
+    write_json,
+)
 
 
 def make(kind: str, path: Path) -> None:
@@ -174,6 +182,20 @@ def test_a_folder_that_may_not_be_entered_is_one_line(command: str, tmp_path: Pa
             os.seteuid(0)
         error = capsys.readouterr().err
         assert caught.value.code == 2 and reason in error and "Traceback" not in error, error
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch) -> None:
+    """A container runs programs as a user who is in no list of users."""
+    if not hasattr(os, "setresuid") or os.geteuid() != 0:
+        pytest.skip("only root can become somebody else")
+    for name in ("HOME", "XDG_CACHE_HOME", CACHE_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+    os.setresuid(123_456, 0, 0)
+    try:
+        with pytest.raises(AssetError, match="this user has no home directory; set TSLAM_BENCH_CACHE"):
+            cache_directory()
+    finally:
+        os.setresuid(0, 0, 0)
 
 
 def test_a_full_disk_behind_standard_output_is_one_line() -> None:

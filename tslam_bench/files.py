@@ -35,16 +35,25 @@ _MOST_RIVALS: Final = 1000
 
 
 def cache_directory() -> Path:
-    """The user cache directory (not created): ``$TSLAM_BENCH_CACHE``, or the platform's cache folder."""
+    """The user cache directory (not created): ``$TSLAM_BENCH_CACHE``, or the platform's cache folder.
+
+    Raises:
+        AssetError: neither is set, as for a user in a container who is in no list of users.
+    """
     override = os.environ.get(CACHE_VARIABLE)
     if override:
         return Path(override).expanduser().absolute()
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", str(Path.home() / "AppData" / "Local")))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        if sys.platform == "darwin":
+            base = Path.home() / "Library" / "Caches"
+        elif sys.platform == "win32":
+            base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise AssetError(
+            f"this user has no home directory; set {CACHE_VARIABLE} to a directory that you can write"
+        ) from error
     return base / "tslam_bench"
 
 
@@ -90,6 +99,20 @@ def kind_of_file(mode: int) -> str:
     return _KINDS.get(stat.S_IFMT(mode), "a file" if stat.S_ISREG(mode) else "something unknown")
 
 
+@contextlib.contextmanager
+def writing(path: Path, errors: tuple[int, ...] | None = None) -> Iterator[None]:
+    """Turns what the system refuses (only ``errors``, if they are named) into one line that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if errors is not None and error.errno not in errors:
+            raise
+        reason = error.strerror or str(error)
+        raise AssetError(
+            f"{path}: cannot be written ({reason}); make room, or choose another place ({CACHE_VARIABLE} moves the cache)"
+        ) from error
+
+
 def place_to_write(path: Path, directory: bool = False) -> Path:
     """Where a file (or directory) ``path`` is written: the path itself, or what it leads to if it is a link.
 
@@ -97,7 +120,7 @@ def place_to_write(path: Path, directory: bool = False) -> Path:
         InvalidInputError: a device, a pipe, a folder (or a file) stands there, which is not to be replaced.
         AssetError: the path cannot be looked at.
     """
-    with _one_line(path):
+    with writing(path):
         place = Path(os.path.realpath(path))
         try:
             mode = place.stat().st_mode
@@ -144,20 +167,6 @@ def read_plain_file(path: Path, most: int) -> bytes:
     return data
 
 
-@contextlib.contextmanager
-def _one_line(path: Path, errors: tuple[int, ...] | None = None) -> Iterator[None]:
-    """Turns what the system refuses (only ``errors``, if they are named) into one line that names ``path``."""
-    try:
-        yield
-    except OSError as error:
-        if errors is not None and error.errno not in errors:
-            raise
-        reason = error.strerror or str(error)
-        raise AssetError(
-            f"{path}: cannot be written ({reason}); make room, or choose another place ({CACHE_VARIABLE} moves the cache)"
-        ) from error
-
-
 def _hidden(path: Path, ending: str = "") -> str:
     """Prefix of the name of something temporary beside ``path``, whose own name may be as long as a name can be."""
     return f".{path.stem[:40]}{ending}-"
@@ -173,14 +182,14 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     target = place_to_write(path)
     ensure_writable_directory(target.parent)
-    with _one_line(path):
+    with writing(path):
         descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=_hidden(target), suffix=target.suffix[:20])
     os.close(descriptor)
     temporary = Path(name)
     try:
-        with _one_line(path, _NO_ROOM):
+        with writing(path, _NO_ROOM):
             yield temporary
-        with _one_line(path):
+        with writing(path):
             temporary.chmod(0o644)
             temporary.replace(target)
     finally:
@@ -212,12 +221,12 @@ def atomic_directory(path: Path) -> Iterator[Path]:
     """
     target = place_to_write(path, directory=True)
     ensure_writable_directory(target.parent)
-    with _one_line(path):
+    with writing(path):
         temporary = Path(tempfile.mkdtemp(dir=target.parent, prefix=_hidden(target)))
     try:
-        with _one_line(path, _NO_ROOM):
+        with writing(path, _NO_ROOM):
             yield temporary
-        with _one_line(path):
+        with writing(path):
             temporary.chmod(0o755)
             _replace_directory(temporary, target)
     finally:

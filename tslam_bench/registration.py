@@ -92,9 +92,10 @@ def make_vec(
             action_repeat,
         )
     from tslam_bench.engine.hand_batch import BatchSettings
+    from tslam_bench.engine.requests import check_names
     from tslam_bench.engine.worker_vector_env import TactileVectorEnv
 
-    chosen = None if objects is None else tuple(objects)
+    chosen = None if objects is None else check_names(objects)
     settings = BatchSettings(object, chosen, split, pose, reward_mode, control_mode, environment_id)
     return TactileVectorEnv(num_envs, settings, processes, timeout, action_repeat)
 

@@ -268,3 +268,35 @@ def test_two_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
             time.sleep(0.1)
     else:
         pytest.fail("the folder stayed locked")
+
+
+WITHOUT_LOCKS = """
+import ctypes, errno, platform, struct, sys
+number = {"x86_64": 73, "aarch64": 32}[platform.machine()]  # of flock
+rules = [(0x20, 0, 0, 0), (0x15, 0, 1, number), (6, 0, 0, 0x50000 | errno.ENOLCK), (6, 0, 0, 0x7FFF0000)]
+code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *rule) for rule in rules))
+program = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(rules), ctypes.addressof(code)))
+libc = ctypes.CDLL(None)
+if libc.prctl(38, 1, 0, 0, 0) or libc.prctl(22, 2, program, 0, 0):  # no new rights, and a filter of system calls
+    sys.exit(77)
+
+from pathlib import Path
+from tslam_bench.evaluation.jobs import Job, JobRunner
+runner = JobRunner(Path(sys.argv[1]), 1, print, lambda *_: None)
+runner.run([Job("one", ("true",))])
+runner.run([Job("one", ("true",))])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can be told to refuse locks")
+def test_a_file_system_without_locks_is_named_and_used(tmp_path: Path) -> None:
+    """As many network file systems: the system call ends with "No locks available"."""
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_LOCKS, str(tmp_path)], capture_output=True, text=True, timeout=60, check=False
+    )
+    if done.returncode == 77:
+        pytest.skip("the system takes no filter")
+    assert done.returncode == 0, done.stderr
+    assert "[1/1] one: done in" in done.stdout and "[1/1] one: done before" in done.stdout
+    said = f"{tmp_path}: cannot be locked (No locks available); start no second run in this folder"
+    assert said in done.stderr

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -214,13 +215,16 @@ def digest_of_an_episode(processes: int | None) -> str:
     return digest.hexdigest()
 
 
-def in_a_daemonic_process(_: int) -> tuple[bool, str, str]:
+def in_a_daemonic_process(_: int) -> tuple[bool, list[str], str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        digest = digest_of_an_episode(None)
+    messages = [str(warning.message) for warning in caught if "daemonic" in str(warning.message)]
     try:
-        tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug")
-        message = ""
+        tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
     except InvalidInputError as error:
-        message = str(error)
-    return multiprocessing.current_process().daemon, message, digest_of_an_episode(0)
+        messages.append(str(error))
+    return multiprocessing.current_process().daemon, messages, digest
 
 
 def test_the_caller_s_own_process_gives_the_same_bits_without_workers():
@@ -231,10 +235,39 @@ def test_the_caller_s_own_process_gives_the_same_bits_without_workers():
     assert multiprocessing.active_children() == children
     envs.close()
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        daemonic, message, there = pool.map(in_a_daemonic_process, [0])[0]
-    assert daemonic and "give processes=0" in message and "\n" not in message
+        daemonic, messages, there = pool.map(in_a_daemonic_process, [0])[0]
+    assert daemonic and len(messages) == 2 and not any("\n" in message for message in messages)
+    assert "the hands are stepped in this one" in messages[0] and "give processes=0" in messages[1]
     assert digest_of_an_episode(0) == digest_of_an_episode(2) == there
     other.close()
+
+
+def test_where_the_system_refuses_processes_the_caller_s_own_does_the_work():
+    """A limit on open files: no pipe, no process. Asked for, it is an error; else it is said once, with the same bits."""
+    code = """
+        import resource, warnings, numpy as np, tslam_bench
+        if __name__ == "__main__":
+            envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=1)
+            first, _ = envs.reset(seed=7)
+            envs.close()
+            used = len(__import__("os").listdir("/proc/self/fd"))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (used + 6, used + 6))
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                envs = tslam_bench.make_vec(num_envs=2, device="cpu", object="mug")
+            again, _ = envs.reset(seed=7)
+            print(*[warning.message for warning in caught if "worker processes" in str(warning.message)])
+            print(all(np.array_equal(first[name], again[name]) for name in first))
+            try:
+                tslam_bench.make_vec(num_envs=2, device="cpu", object="mug", processes=2)
+            except tslam_bench.errors.BenchmarkError as error:
+                print(error)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 3 and lines[1] == "True", (lines, done.stderr)
+    assert lines[0].startswith("the system refuses worker processes ([Errno 24] Too many open files")
+    assert lines[2].endswith("give processes=0")
 
 
 class Interruption(Exception):

@@ -55,6 +55,31 @@ def test_a_worker_has_settings_of_its_own(monkeypatch):
     assert "MALLOC_TRIM_THRESHOLD_" not in os.environ
 
 
+def test_preparation_says_that_it_needs_a_process():
+    """What may crash is kept to a process of its own, so there is no going on without."""
+    code = """
+        import os, resource
+        from tslam_bench.errors import AssetError
+        from tslam_bench.preparation.workers import WorkerPool
+        used = len(os.listdir("/proc/self/fd"))
+        for more in range(8):  # wherever it runs out
+            resource.setrlimit(resource.RLIMIT_NOFILE, (used + more, 100))
+            pool = WorkerPool(abs, size=1, time_limit=60.0)
+            try:
+                pool.submit("one", (-1,))
+                pool.close()
+                break
+            except AssetError as error:
+                print(error)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60)
+    lines = done.stdout.splitlines()
+    assert len(lines) >= 3 and done.returncode == 0, done.stderr
+    assert set(lines) == {
+        "preparation works in processes, and the system refuses one (Too many open files); give it fewer --workers"
+    }
+
+
 def _runs(pid: int) -> bool:
     try:
         os.kill(pid, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -353,3 +354,29 @@ def test_scoring_and_the_page_need_few_packages(tmp_path: Path, box, kind: str) 
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert float(result.stdout) > 0.8
+
+
+def test_scoring_goes_on_where_the_system_refuses_processes() -> None:
+    """A daemonic process of a pool, and a limit on open files: one worker instead of two, said once."""
+    code = """
+        import multiprocessing, os, resource, warnings
+        from tslam_bench.scoring.scoring import worker_pool
+
+        def work(what):
+            warnings.simplefilter("always")
+            with warnings.catch_warnings(record=True) as caught, worker_pool(2) as pool:
+                print(*pool.map(abs, [-1, -2]), *pool.map(pow, [2, 3], [3, 2]), [str(w.message)[:40] for w in caught])
+
+        if __name__ == "__main__":
+            child = multiprocessing.get_context("fork").Process(target=work, args=("daemon",), daemon=True)
+            child.start()
+            child.join()
+            used = len(os.listdir("/proc/self/fd"))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (used + 1, used + 1))
+            work("files")
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines() == [
+        "1 2 8 9 ['this is a daemonic process, which may st']",
+        "1 2 8 9 ['the system refuses worker processes ([Er']",
+    ], done.stderr

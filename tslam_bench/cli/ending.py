@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,7 +23,7 @@ def one_line_errors(program: str) -> Iterator[None]:
     something: its traceback, then one line), 130 (interrupted) or 141 (the reader of a pipe has gone).
     """
     try:
-        with named_extra():
+        with named_extra(), _one_line_warnings(program):
             yield
         sys.stdout.flush()  # here, where what goes wrong is one line
     except UserCodeError as error:
@@ -44,6 +45,23 @@ def one_line_errors(program: str) -> Iterator[None]:
         where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         print(visible(f"{program}: {where}{error.strerror or error}"), file=sys.stderr)
         sys.exit(2)
+
+
+@contextlib.contextmanager
+def _one_line_warnings(program: str) -> Iterator[None]:
+    """Warnings of this package without the line of code that they come from."""
+    usual = warnings.formatwarning
+
+    def one_line(message: Warning | str, category: type, filename: str, lineno: int, line: str | None = None) -> str:
+        if not filename.startswith(_PACKAGE):
+            return usual(message, category, filename, lineno, line)
+        return visible(f"{program}: {message}") + "\n"
+
+    warnings.formatwarning = one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _drop_output() -> None:

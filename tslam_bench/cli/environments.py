@@ -151,7 +151,7 @@ def _video(command: Video) -> None:
     import numpy as np
     from PIL import Image
 
-    from tslam_bench.engine.rendering import vulkan_device_available
+    from tslam_bench.engine.rendering import NO_VULKAN, vulkan_device_available
     from tslam_bench.files import atomic_file, check_output
 
     variant = get_variant(command.environment)
@@ -159,10 +159,7 @@ def _video(command: Video) -> None:
         raise InvalidInputError(f"{command.output}: unknown kind of video; end the name in .webp or .gif")
     check_output(command.output)
     if not vulkan_device_available():
-        raise AssetError(
-            "video: no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU "
-            "(tslam-bench doctor tells how)"
-        )
+        raise AssetError(f"video: {NO_VULKAN}")
     from tslam_bench.evaluation.policies import make_baseline, policy_label
     from tslam_bench.evaluation.policy import CheckedPolicy
     from tslam_bench.plugins import parse_arguments

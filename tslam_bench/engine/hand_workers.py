@@ -74,8 +74,13 @@ class HandWorkers:
                 process = context.Process(
                     target=_work, args=(theirs, ours, raw, num_envs, part, settings, core), daemon=True
                 )
-                process.start()
-                theirs.close()
+                try:
+                    process.start()
+                except OSError:
+                    ours.close()
+                    raise
+                finally:
+                    theirs.close()
                 self._selector.register(ours, selectors.EVENT_READ, len(self._workers))
                 self._workers.append((process, ours))
             self._collect(

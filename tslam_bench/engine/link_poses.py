@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tslam_bench.compiled import njit
 
 POSE_SIZE = 7
 """Numbers of a packed pose: unit quaternion (w, x, y, z), then position (m), as SAPIEN packs it."""

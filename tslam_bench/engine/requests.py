@@ -5,7 +5,7 @@ All raise InvalidInputError. No torch, no simulator.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -42,6 +42,21 @@ def check_reward_mode(reward_mode: str) -> str:
 def check_control_mode(control_mode: str) -> str:
     """Returns a known control mode."""
     return _one_of("control_mode", control_mode, CONTROL_MODES)
+
+
+def check_names(objects: Any) -> tuple[str, ...]:
+    """Returns the names of a list of objects; which of them there are is for others to say."""
+    names = _plain(objects)
+    if isinstance(names, (str, bytes, set, frozenset)) or not isinstance(names, Iterable):  # sets: in no order
+        raise InvalidInputError(f"objects {objects!r}: must be a list of names; object={objects!r} is one")
+    return tuple(check_name(name) for name in names)
+
+
+def check_name(name: Any) -> str:
+    """Returns a text as it is."""
+    if not isinstance(name, str):
+        raise InvalidInputError(f"object {name!r}: must be a name, a text")
+    return name
 
 
 def check_whole(name: str, value: Any, low: int, high: int) -> int:
@@ -86,6 +101,8 @@ def check_reset(seed: Any, options: Mapping[str, Any] | None, num_envs: int, kno
         num_envs: E.
         known: which objects and poses there are.
     """
+    if options is not None and not isinstance(options, Mapping):
+        raise InvalidInputError(f"options {options!r}: must be a dictionary; for example options={{'pose': 3}}")
     options = options or {}
     objects = _option(options, "object", num_envs)
     poses = _option(options, "pose", num_envs)
@@ -122,7 +139,10 @@ def check_mask(options: Mapping[str, Any], num_envs: int) -> NDArray[np.bool_]:
         for env in numbers if isinstance(numbers, list) else [numbers]:
             mask[check_whole("options['env_idx']", env, 0, num_envs - 1)] = True
         return mask
-    mask = np.ones(num_envs, dtype=bool) if asked is None else np.asarray(_plain(asked))
+    try:
+        mask = np.ones(num_envs, dtype=bool) if asked is None else np.asarray(_plain(asked))
+    except ValueError as error:
+        raise InvalidInputError(f"options['reset_mask'] {asked!r}: give ({num_envs},) bool") from error
     if mask.shape != (num_envs,) or (mask.dtype != bool and mask.size):
         raise InvalidInputError(f"options['reset_mask']: shape {mask.shape} {mask.dtype}; give ({num_envs},) bool")
     return mask

@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from tslam_bench.compiled import njit
 from tslam_bench.constants import GRID_SIZE, TOUCH_DISTANCE, VOXEL_EDGE, WORKSPACE_LOW
 from tslam_bench.engine.arrays import NumpyBackend
 from tslam_bench.engine.field_atlas import Fields

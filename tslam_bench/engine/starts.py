@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tslam_bench.constants import DEFAULT_SPLIT, NUM_JOINTS, TRAIN_OBJECTS
+from tslam_bench.engine.requests import check_name, check_names
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.hand_constants import JOINT_LIMITS, START_ARM_HIGH, START_ARM_LOW, START_FINGER_NOISE
-from tslam_bench.objects.splits import find_split, resolve_name
+from tslam_bench.objects.splits import SPLITS, find_split, known_names, resolve_name
 from tslam_bench.objects.store import PreparedObject, list_objects, load_object, read_record
 from tslam_bench.variants import FREE, Variant
 
@@ -67,6 +68,8 @@ class StartSampler:
     ) -> None:
         if object is not None and objects is not None:
             raise InvalidInputError("object and objects: give one or the other, not both")
+        if split is not None and not isinstance(split, str):
+            raise InvalidInputError(f"split {split!r}: must be a name, a text")
         self.split = split
         self.variant = variant
         self._pose = None if pose is None else variant.check_pose(pose)
@@ -75,7 +78,11 @@ class StartSampler:
         if object is not None:
             self.names: tuple[str, ...] = (self.load(object).name,)
         elif objects is not None:
-            self.names = tuple(objects)
+            self.names = check_names(objects)
+            known = {name for one in (SPLITS if split is None else (split,)) for name in known_names(one)}
+            for name in self.names:
+                if name not in known:  # an alias; or an error, now and not in a later episode that draws it
+                    self.check_name(name)
         else:
             self.names = _prepared(split)
         if not self.names:
@@ -100,7 +107,7 @@ class StartSampler:
 
     def _key(self, name: str) -> tuple[str, str]:
         """Name without alias, and split; looked up once, as it reads the cache's folders."""
-        if name not in self._keys:
+        if check_name(name) not in self._keys:
             split = find_split(name) if self.split is None else self.split
             self._keys[name] = resolve_name(name, split), split
         return self._keys[name]

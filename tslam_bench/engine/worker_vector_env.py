@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -39,7 +41,8 @@ class TactileVectorEnv(VectorEnv):
     Args:
         num_envs: environments in all.
         settings: objects, pose, reward mode, control mode.
-        processes: worker processes; None means the cores, but no more than there are environments. 0 steps in the caller's own
+        processes: worker processes; None means the cores, but no more than there are environments, or none where the system
+            refuses them (a warning says so). 0 steps in the caller's own
             process, without workers and shared memory, for notebooks, daemonic pools and debuggers: the same bits.
         timeout: seconds after which a worker that does not answer a step counts as hung.
         action_repeat: control steps that a step holds its action for; rewards and counts are added up. A divisor of the
@@ -77,14 +80,27 @@ class TactileVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun = False
-        if workers == 0:
+        self._hands = None if workers == 0 else self._workers(settings, workers, float(timeout))
+        if self._hands is None:
             self._arrays: dict[str, NDArray] = {
                 name: np.zeros((self.num_envs, *shape), dtype) for name, (shape, dtype) in batch_arrays().items()
             }
             self._hands = HandBatch(self.num_envs, settings, self._arrays)
         else:
-            self._hands = HandWorkers(self.num_envs, settings, workers, float(timeout))
             self._arrays = self._hands.arrays
+
+    def _workers(self, settings: BatchSettings, workers: int | None, timeout: float) -> HandWorkers | None:
+        """The worker processes; None where the system refuses processes and nobody asked for a number of them."""
+        reason = "this is a daemonic process, which may start no others"
+        if workers is not None or not multiprocessing.current_process().daemon:
+            try:
+                return HandWorkers(self.num_envs, settings, workers, timeout)
+            except OSError as error:  # no more processes, files or shared memory
+                reason = f"the system refuses worker processes ({error})"
+                if workers is not None:
+                    raise WorkerError(f"{reason}; give processes=0") from error
+        warnings.warn(f"{reason}; the hands are stepped in this one, with the same bits (processes=0)", stacklevel=4)
+        return None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -217,7 +218,11 @@ def _stop(current: _Running) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[int | None]:
-    """Holds a lock that jobs inherit. Systems without ``fcntl`` go without."""
+    """Holds a lock that jobs inherit. Systems without ``fcntl``, and file systems without locks, go without.
+
+    Raises:
+        InvalidInputError: another run holds it.
+    """
     try:
         import fcntl
     except ImportError:
@@ -226,7 +231,12 @@ def _locked(path: Path) -> Iterator[int | None]:
     with path.open("w") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             folder = path.parent.parent
             raise InvalidInputError(f"{folder}: another run uses this folder; wait for it or choose another") from None
+        except OSError as error:  # many network file systems
+            reason = f"cannot be locked ({error.strerror})"
+            warnings.warn(f"{path.parent.parent}: {reason}; start no second run in this folder", stacklevel=1)
+            yield None
+            return
         yield stream.fileno()

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -30,7 +29,7 @@ from tslam_bench.machine import processor_name
 from tslam_bench.objects.splits import OBJECTS
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.rollout import CHECKPOINT_SPACING, Rollout
-from tslam_bench.scoring.scoring import worker_pool
+from tslam_bench.scoring.scoring import WorkerDied, worker_pool
 from tslam_bench.scoring.submission import Submission, read_submission
 from tslam_bench.scoring.verification import Tolerances, Verdict, VerificationRecord, pack_steps, record_path
 from tslam_bench.version import __version__
@@ -139,7 +138,7 @@ def _replay_objects(
         replayed = (pool.map if pool else map)(_verify_part, parts, [segments] * len(parts), [width] * len(parts))
         try:
             yield from zip(names, replayed, strict=True)
-        except BrokenProcessPool as error:
+        except WorkerDied as error:
             raise WorkerError("verify: a process died, perhaps of memory; run the command again to go on") from error
 
 

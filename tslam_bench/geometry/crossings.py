@@ -8,8 +8,9 @@ above it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tslam_bench.compiled import njit
 
 _POINTS_PER_CELL = 8
 _MOST_CELLS = 512

@@ -17,8 +17,9 @@ import itertools
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tslam_bench.compiled import njit
 
 APART: Final = 1e-4
 """Corners of the surface stay this far from the ends of the edges that they lie on, as a share of the edge. Where samples equal

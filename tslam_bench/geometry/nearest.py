@@ -11,8 +11,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tslam_bench.compiled import njit
 
 _LEAF: Final = 32
 """Samples of a leaf: many, since comparing them is one loop of vector instructions."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
+from tslam_bench.errors import AssetError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -49,6 +51,11 @@ def _end_with_parent() -> None:
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
+
+
+def _refused(error: OSError) -> AssetError:
+    reason = error.strerror or str(error)
+    return AssetError(f"preparation works in processes, and the system refuses one ({reason}); give it fewer --workers")
 
 
 @dataclass
@@ -127,21 +134,34 @@ class WorkerPool(Generic[Item, Result]):
             self._stop(worker)
 
     def _start(self) -> _Worker[Item]:
+        """Another process: without one there is nothing that a crash could be kept to.
+
+        Raises:
+            AssetError: the system refuses it.
+        """
+        if multiprocessing.current_process().daemon:
+            raise AssetError("preparation works in processes, and a daemonic one may start none; start it elsewhere")
         context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
+        try:
+            ours, theirs = context.Pipe()
+        except OSError as error:
+            raise _refused(error) from error
         process = context.Process(target=_serve, args=(theirs, self.function, self.memory_limit), daemon=True)
         variables = dict.fromkeys(_THREAD_VARIABLES, "1") | _ALLOCATOR_VARIABLES
         before = {variable: os.environ.get(variable) for variable in variables}
         os.environ.update(variables)  # read when the libraries load, in the new process
         try:
             process.start()
+        except OSError as error:
+            ours.close()
+            raise _refused(error) from error
         finally:
+            theirs.close()
             for variable, value in before.items():
                 if value is None:
                     os.environ.pop(variable, None)
                 else:
                     os.environ[variable] = value
-        theirs.close()
         worker: _Worker[Item] = _Worker(process, ours)
         self._workers.append(worker)
         return worker

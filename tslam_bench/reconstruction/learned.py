@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import pickle
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -103,8 +104,10 @@ def save_checkpoint(
         "weights": {name: tensor.detach().clone().contiguous() for name, tensor in network.state_dict().items()},
         **(extra or {}),
     }
+    data = io.BytesIO()  # torch's own writing of a file ends in a library error on a full disk
+    torch.save(content, data)
     with atomic_file(path) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(data.getbuffer())
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

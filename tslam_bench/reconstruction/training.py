@@ -18,6 +18,7 @@ import torch.nn.functional as functional
 from numpy.typing import NDArray
 
 from tslam_bench.constants import GRID_SIZE
+from tslam_bench.curves import Curves
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import ensure_writable_directory
 from tslam_bench.grids import voxel_centres
@@ -138,9 +139,7 @@ def train(
 
     writer = None
     if log_directory is not None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        writer = SummaryWriter(str(log_directory), purge_step=start)
+        writer = Curves(Path(log_directory), start)
     network.train()
     try:
         with torch_threads(config.threads):
@@ -148,7 +147,7 @@ def train(
                 loss = _step(network, optimizer, shapes, config, step)
                 done = step + 1
                 if writer is not None:
-                    writer.add_scalar("loss/cross_entropy", loss, done)
+                    writer.add("loss/cross_entropy", loss, done)
                 if progress:
                     progress(done, loss)
                 stopped = stop is not None and done < config.steps and stop(done)

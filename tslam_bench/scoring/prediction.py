@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 import trimesh
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from tslam_bench.compiled import njit
 from tslam_bench.constants import OCCUPANCY_THRESHOLD, SURFACE_SAMPLES, VOXEL_EDGE, WORKSPACE_EDGE
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.geometry.crossings import crossing_numbers

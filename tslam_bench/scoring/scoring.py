@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -30,10 +31,15 @@ EXPECTED_IMPLAUSIBLE: Final = 0.02
 hulls, the field's gradient is no longer the way out. Of 450 honest sets of eight poses, eight had any, at most 0.8 %."""
 
 
+class WorkerDied(AssetError):
+    """A process was killed that worked for others."""
+
+
 class WorkerPool:
     """Processes that score objects and keep what they loaded for the next submission.
 
     One that dies (a system without memory kills the largest) takes the submission with it that was scored, not the next ones.
+    Where the system refuses processes, this one does the work; a warning says so once.
     """
 
     def __init__(self, workers: int) -> None:
@@ -41,18 +47,33 @@ class WorkerPool:
         self._processes: ProcessPoolExecutor | None = None
 
     def map(self, function: Callable[..., Any], *values: Iterable[Any]) -> Iterator[Any]:
-        """As the builtin. Raises AssetError if a process dies."""
-        if self._processes is None:
-            # spawn: a forked copy of a process whose libraries have started threads may hang
-            context = multiprocessing.get_context("spawn")
-            self._processes = ProcessPoolExecutor(self._workers, mp_context=context)
+        """As the builtin. Raises WorkerDied if a process dies."""
+        given = [list(value) for value in values]
         try:
-            yield from self._processes.map(function, *values)
+            started = self._start(function, given) if self._workers > 1 else None
+            yield from map(function, *given) if started is None else started
         except BrokenProcessPool as error:
             self.close()
-            raise AssetError(
+            raise WorkerDied(
                 "a process that scored was killed, probably for want of memory; free some, or score with --workers 1"
             ) from error
+
+    def _start(self, function: Callable[..., Any], values: Sequence[list[Any]]) -> Iterator[Any] | None:
+        """Results of the processes; None, and one worker from now on, where there can be none."""
+        reason = "this is a daemonic process, which may start no others"
+        if not multiprocessing.current_process().daemon:
+            try:
+                if self._processes is None:
+                    # spawn: a forked copy of a process whose libraries have started threads may hang
+                    context = multiprocessing.get_context("spawn")
+                    self._processes = ProcessPoolExecutor(self._workers, mp_context=context)
+                return self._processes.map(function, *values)
+            except (OSError, ImportError, NotImplementedError) as error:  # no more processes or files; no semaphores
+                reason = f"the system refuses worker processes ({error})"
+                self.close()
+        self._workers = 1
+        warnings.warn(f"{reason}; this one does the work alone, with the same results", stacklevel=3)
+        return None
 
     def close(self) -> None:
         """Ends the processes; the next call of :meth:`map` starts others."""

@@ -213,7 +213,7 @@ def test_litter_in_an_archive_is_no_second_mesh(tmp_path):
     np.testing.assert_allclose(read_mesh_file(path).extents, EXTENTS, atol=1e-6)
 
 
-HARMLESS = ("chain.glb", "count.dae", "outside.obj", "parents.glb", "polygon.off", "views.glb")
+HARMLESS = ("chain.glb", "count.dae", "outside.obj", "parents.glb", "views.glb")
 """Files that overstate or repeat what is not used, or name a file that is not read: they are taken for what they hold."""
 
 

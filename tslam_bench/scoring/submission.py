@@ -26,13 +26,13 @@ from tslam_bench.constants import PROTOCOL_POSES
 from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, link_or_copy, write_json
+from tslam_bench.geometry.ply import MAX_MESH_ELEMENTS, read_ply
 from tslam_bench.objects.splits import ALIASES, OBJECTS
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring.info import SubmissionInfo, parse_info
 from tslam_bench.scoring.rollout import OBJECT_NAME, Rollout, parse_rollout_file, rollout_file
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 from tslam_bench.scoring.untrusted_files import FileSource, open_source
-from tslam_bench.scoring.untrusted_mesh import MAX_MESH_ELEMENTS, read_ply
 from tslam_bench.text import visible
 
 INFO_FILE: Final = "submission.json"

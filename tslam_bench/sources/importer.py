@@ -35,6 +35,8 @@ SKIPPED_SUFFIXES = (
     "",
 )
 """Files that lie beside meshes and are not reported."""
+READING = 2
+"""Bumped when a file is read or repaired another way; the benchmark's own objects are not imported."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 """Units of an organiser's manifest, in metres."""
 
@@ -66,7 +68,7 @@ class ImportedSource:
             digest = sha256_file(Path(self.path))
         except OSError:
             digest = "unreadable"
-        return f"imported:{digest}:{self.up}:{self.unit}:{self.category}:{self.license}:{self.origin}"
+        return f"imported:{READING}:{digest}:{self.up}:{self.unit}:{self.category}:{self.license}:{self.origin}"
 
     def load(self, cache: Path) -> SourceMesh:
         """See :class:`tslam_bench.sources.source.Source`. Errors name the file."""
@@ -173,7 +175,7 @@ def read_set(manifest: Path) -> tuple[str, list[ImportedSource]]:
         InvalidInputError: names the entry that is wrong.
     """
     try:
-        content = json.loads(manifest.read_text(encoding="utf-8"))
+        content = json.loads(manifest.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InvalidInputError(f"{manifest}: no such file") from error
     except (OSError, ValueError) as error:

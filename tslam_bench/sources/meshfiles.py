@@ -9,7 +9,6 @@ with, is found before it reads. The rest is left to the memory and the time that
 from __future__ import annotations
 
 import io
-import re
 import zipfile
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -21,7 +20,8 @@ import trimesh
 from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.files import read_plain_file
 from tslam_bench.geometry.meshes import TriangleMesh
-from tslam_bench.sources import collada, gltf
+from tslam_bench.geometry.ply import read_ply
+from tslam_bench.sources import collada, gltf, readers
 
 UpAxis = Literal["auto", "x", "y", "z"]
 
@@ -108,17 +108,20 @@ def parse_mesh(data: bytes, suffix: str, up: UpAxis = "auto", files: dict[str, b
             raise AssetError(f"scene with {document.instances} geometries; the limit is {MAX_INSTANCES}")
     elif suffix in (".glb", ".gltf"):
         gltf.check_data(gltf.read_header(data, suffix))
-    elif suffix == ".obj" and re.search(rb"^f[^\n]*?[ \t]0+(?=[\s/])", data, re.MULTILINE):
-        raise AssetError(".obj faces refer to vertex 0; its vertices count from 1")  # trimesh would take the last
-    options: dict[str, Any] = {} if suffix in (".dae", ".stl", ".off") else {"skip_materials": True}
+        data = data.removeprefix(readers.BYTE_ORDER_MARK)
+    elif suffix == ".obj" and not readers.is_plain_obj(data):
+        data = readers.plain_obj(data)
     if suffix not in (".glb", ".gltf"):
         resolver = _Resolver({})  # the others refer to materials and textures only, which are not needed
     try:
         with np.errstate(all="ignore"):
-            scene = trimesh.load_scene(
-                io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options
-            )
+            scene = _load(data, suffix, resolver)
             vertices, faces = _bake(scene, merge=suffix not in (".glb", ".gltf"))
+            if suffix == ".obj" and len(faces) != (stated := readers.obj_triangles(data)):
+                data = readers.plain_obj(data)  # faces of several spellings: trimesh reads all as the first
+                vertices, faces = _bake(_load(data, suffix, resolver), merge=True)
+                if len(faces) != stated:
+                    raise AssetError(f"not a readable .obj file ({len(faces)} triangles of {stated} could be read)")
     except AssetError:
         raise
     except MemoryError as error:
@@ -178,6 +181,22 @@ def _bake(scene: trimesh.Scene, merge: bool) -> tuple[np.ndarray, np.ndarray]:
         faces.append(np.asarray(placed.faces, dtype=np.int64) + offset)
         offset += len(placed.vertices)
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _load(data: bytes, suffix: str, resolver: _Resolver) -> trimesh.Scene:
+    """The scene in a file's bytes, vertices as they stand."""
+    match suffix:
+        case ".stl":
+            return readers.read_stl(data, MAX_TRIANGLES).scene()
+        case ".off":
+            return readers.read_off(data, MAX_TRIANGLES).scene()
+        case ".ply":
+            try:
+                return read_ply(data, ".ply", MAX_TRIANGLES).scene()
+            except InvalidInputError as error:
+                raise AssetError(f"not a readable .ply file ({error})") from error
+    options: dict[str, Any] = {} if suffix == ".dae" else {"skip_materials": True}
+    return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options)
 
 
 class _Resolver(trimesh.resolvers.Resolver):

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.scoring.untrusted_mesh import MAX_MESH_ELEMENTS, read_ply
+from tslam_bench.geometry.ply import MAX_MESH_ELEMENTS, read_ply
 
 CUBE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 QUADS = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [2, 3, 7, 6], [1, 2, 6, 5], [0, 4, 7, 3]]

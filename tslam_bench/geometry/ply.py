@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tslam_bench.errors import InvalidInputError
 
 MAX_MESH_ELEMENTS: Final = 1_000_000
-"""Most vertices, and most triangles, of a ``.ply`` reconstruction."""
+"""Most vertices, and most triangles, unless a caller says otherwise."""
 MAX_PROPERTIES: Final = 64
 """Most properties of all elements together."""
 MAX_HEADER: Final = 16 * 2**10
@@ -74,26 +74,27 @@ class _Element:
     index: str = ""
 
 
-def read_ply(data: bytes, where: str) -> trimesh.Trimesh:
+def read_ply(data: bytes, where: str, most: int = MAX_MESH_ELEMENTS) -> trimesh.Trimesh:
     """The mesh in a PLY file.
 
     Args:
         data: the file's bytes.
         where: the file's name for messages.
+        most: largest number of vertices, and of triangles.
 
     Raises:
         InvalidInputError: damaged, truncated, of another kind, or above a limit.
     """
     try:
-        text, elements, begin = _read_header(data)
+        text, elements, begin = _read_header(data, most)
         body = _numbers(data[begin:]) if text else memoryview(data)[begin:]
         columns: dict[str, NDArray] = {}
         for element in elements:
-            body = _read_element(body, element, columns)
+            body = _read_element(body, element, columns, most)
         if len(body):
             raise _Damaged("more follows its last element")
         vertices = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
-        faces = _triangles(columns["corners"], columns["lengths"])
+        faces = _triangles(columns["corners"], columns["lengths"], most)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise _Damaged("truncated, or faces refer to missing vertices")
     except _Damaged as error:
@@ -101,7 +102,7 @@ def read_ply(data: bytes, where: str) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _read_header(data: bytes) -> tuple[bool, list[_Element], int]:
+def _read_header(data: bytes, most: int) -> tuple[bool, list[_Element], int]:
     """Whether the body is text, the elements, and where the body begins."""
     end = re.search(rb"^end_header[ \t]*\r?\n", data[:MAX_HEADER], re.MULTILINE)
     if not re.match(rb"ply[ \t]*[\r\n]", data) or end is None:
@@ -116,8 +117,8 @@ def _read_header(data: bytes) -> tuple[bool, list[_Element], int]:
             case ["format", name, "1.0"] if name in _ENDIAN and not encoding:
                 encoding = name
             case ["element", name, count] if re.fullmatch(r"\d{1,18}", count) and encoding:
-                if int(count) > MAX_MESH_ELEMENTS:
-                    raise _Damaged(f"{int(count)} {name[:40]} elements; at most {MAX_MESH_ELEMENTS}")
+                if int(count) > most:
+                    raise _Damaged(f"{int(count)} {name[:40]} elements; at most {most}")
                 if name in [known for known, _, _ in elements]:
                     raise _Damaged(f"element {name[:40]!r} twice")
                 elements.append((name, int(count), []))
@@ -164,7 +165,7 @@ def _numbers(text: bytes) -> memoryview:
     return memoryview(numbers.view(np.uint8)) if len(numbers) else memoryview(b"")  # type: ignore[arg-type]
 
 
-def _read_element(body: memoryview, element: _Element, columns: dict[str, NDArray]) -> memoryview:
+def _read_element(body: memoryview, element: _Element, columns: dict[str, NDArray], most: int) -> memoryview:
     """Reads the element that ``body`` begins with and returns what is left.
 
     Args:
@@ -176,7 +177,7 @@ def _read_element(body: memoryview, element: _Element, columns: dict[str, NDArra
     for number, p in enumerate(element.properties):
         length = 1
         if p.length is not None:
-            length = _length(body, position, p.length) if element.count else 0
+            length = _length(body, position, p.length, most) if element.count else 0
             fields.append((f"length {number}", p.length))
             position += p.length.itemsize
         fields.append((p.name, p.stored) if p.length is None else (p.name, p.stored, (length,)))
@@ -196,27 +197,27 @@ def _read_element(body: memoryview, element: _Element, columns: dict[str, NDArra
             columns[p.name] = _cast(rows[p.name], p.stated)
         elif p.name == element.index:
             if rows is None:
-                corners, lengths, end = _read_rows(body, element, number)
+                corners, lengths, end = _read_rows(body, element, number, most)
             else:
                 corners, lengths = rows[p.name].reshape(-1), rows[f"length {number}"]
             columns["corners"], columns["lengths"] = _cast(corners, p.stated), lengths.astype(np.int64)
             return body[end:]
     if rows is None:
-        _, _, end = _read_rows(body, element, -1)
+        _, _, end = _read_rows(body, element, -1, most)
     return body[end:]
 
 
-def _length(body: memoryview, position: int, dtype: np.dtype) -> int:
+def _length(body: memoryview, position: int, dtype: np.dtype, most: int) -> int:
     """Length of the list that begins at a position."""
     if position + dtype.itemsize > len(body):
         raise _Damaged("truncated")
     stated = np.frombuffer(body, dtype, 1, position)[0]
-    if not 0 <= stated <= MAX_MESH_ELEMENTS or stated != int(stated):
-        raise _Damaged(f"a list of {stated:g} values; at most {MAX_MESH_ELEMENTS}")
+    if not 0 <= stated <= most or stated != int(stated):
+        raise _Damaged(f"a list of {stated:g} values; at most {most}")
     return int(stated)
 
 
-def _read_rows(body: memoryview, element: _Element, wanted: int) -> tuple[NDArray, NDArray, int]:
+def _read_rows(body: memoryview, element: _Element, wanted: int, most: int) -> tuple[NDArray, NDArray, int]:
     """Lists of several lengths, row by row: values and lengths of the property ``wanted``, and where the element ends."""
     # Scalars are passed over: (bytes before the list, reader of its length, bytes of a value, whether it is wanted).
     plan: list[tuple[int, struct.Struct, int, bool]] = []
@@ -238,8 +239,8 @@ def _read_rows(body: memoryview, element: _Element, wanted: int) -> tuple[NDArra
                 raise _Damaged("truncated")
             length = reader.unpack_from(body, position)[0]
             position += reader.size
-            if not 0 <= length <= MAX_MESH_ELEMENTS or length != int(length):
-                raise _Damaged(f"a list of {length:g} values; at most {MAX_MESH_ELEMENTS}")
+            if not 0 <= length <= most or length != int(length):
+                raise _Damaged(f"a list of {length:g} values; at most {most}")
             following = position + int(length) * size
             if keep:
                 lengths.append(int(length))
@@ -262,7 +263,7 @@ def _cast(values: NDArray, stated: np.dtype) -> NDArray:
         return values.astype(stated)
 
 
-def _triangles(corners: NDArray, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+def _triangles(corners: NDArray, lengths: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     """Polygons cut into triangles: first the triangles, then the halves of quadrangles, then fans.
 
     Args:
@@ -274,9 +275,9 @@ def _triangles(corners: NDArray, lengths: NDArray[np.int64]) -> NDArray[np.int64
     if corners.dtype.kind == "f" and not (corners == np.floor(corners)).all():
         raise _Damaged("corners of faces that are no whole numbers")
     count = int((lengths - 2).sum())
-    if count > MAX_MESH_ELEMENTS:
-        raise _Damaged(f"{count} triangles; at most {MAX_MESH_ELEMENTS}")
-    corners = np.clip(corners, -1, MAX_MESH_ELEMENTS).astype(np.int64)  # what is out of range stays out of range
+    if count > most:
+        raise _Damaged(f"{count} triangles; at most {most}")
+    corners = np.clip(corners, -1, most).astype(np.int64)  # what is out of range stays out of range
     starts = np.cumsum(lengths) - lengths
     three, four, many = starts[lengths == 3], starts[lengths == 4], lengths > 4
     halves = [corners[four[:, None] + half] for half in ([0, 1, 2], [2, 3, 0])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -15,7 +15,7 @@ from tslam_bench.cli.progress import Progress
 from tslam_bench.cli.score import check_workers
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.files import atomic_file, check_output, ensure_writable_directory, write_json
+from tslam_bench.files import atomic_file, check_output, ensure_writable_directory
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.score_file import SubmissionScore
 from tslam_bench.scoring.scoring import score_submission, worker_pool
@@ -26,25 +26,33 @@ from tslam_bench.scoring.verification import find_record
 from .page import build_page
 from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
 from .ranking import rank
+from .shown import PICTURES, Key, Shown, write_pictures
+from .training import find_records, read_records
 
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"
+VIEWER_FILE: Final = "viewer.html"
+"""Beside a page, it shows objects of entries in 3D."""
 PICTURE_FOLDER: Final = ".pictures"
+"""Everything that was drawn for this folder; the page shows what lies in ``PICTURES``."""
 
 
 @dataclass(frozen=True)
 class LeaderboardArguments:
-    """Ranks submissions and builds one static page: index.html and leaderboard.json.
+    """Ranks submissions and builds a static page in one folder: index.html, its pictures/ and leaderboard.json.
 
     Submissions without a score file of the same content are scored first.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Submissions, score files, or folders that hold them (also in their subfolders submissions/ and scores/)."""
+    """Submissions, score files, or folders that hold them (also in their subfolders submissions/ and scores/). The training
+    curves of models in their subfolder models/ are shown too."""
     output: Path = Path("leaderboard_page")
     """Folder for the page."""
     scores: Path | None = None
     """Folder of score files; their submissions are looked for in the folder submissions/ beside it."""
+    training: tuple[Path, ...] = ()
+    """Folders of trained policies, or folders that hold such: their training curves are shown."""
     trust_scores: bool = False
     """Take the figures of score files that were made elsewhere as they are, even where their submissions are at hand and
     could be scored. They never count as replayed."""
@@ -86,7 +94,13 @@ def page_main(arguments: Sequence[str]) -> None:
     scores = _score_missing(scores, submissions, parsed.workers, parsed.trust_scores, batch)
     if not scores:
         batch.finish("there is nothing to show")
-    leaderboard = rank(scores)
+    places = [path.parent if path.name == "scores" else path for path in paths if path.is_dir()]
+    records: list[Path] = []
+    for path in find_records([*parsed.training, *places]):
+        with batch.item(str(path)):
+            read_records([path])
+            records.append(path)
+    leaderboard = rank(scores, read_records(records))
 
     pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
     with Progress("pictures", "picture", leave=False) as bar:
@@ -94,16 +108,36 @@ def page_main(arguments: Sequence[str]) -> None:
             list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, bar.show
         )
     images = {key: drawn[picture] for key, picture in pictures.items() if picture in drawn}
-    html = build_page(leaderboard, images)
-    write_json(parsed.output / DATA_FILE, leaderboard)
-    with atomic_file(parsed.output / PAGE_FILE) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+    size = write_page(leaderboard, write_pictures(images, parsed.output / PICTURES), parsed.output)
     if parsed.json:
         print(json.dumps(leaderboard, indent=2, sort_keys=True))
     else:
         entries = sum(len(table["entries"]) for table in leaderboard["tables"])
-        print(f"{parsed.output / PAGE_FILE}: {entries} entries, {len(html.encode()) / 2**20:.1f} MiB")
+        print(
+            f"{parsed.output / PAGE_FILE}: {entries} entries, {size / 2**20:.1f} MiB, {len(images)} pictures beside it"
+        )
     batch.finish("the page shows the others")
+
+
+def page_texts(leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], folder: Path) -> dict[str, str]:
+    """File name -> text of a page in ``folder``: the page, which names the viewer if that lies there, and its data."""
+    viewer = {
+        (entry["content_hash"], name)
+        for table in (leaderboard["tables"] if (folder / VIEWER_FILE).is_file() else ())
+        for entry in table["entries"]
+        for name in table["objects"]
+    }
+    data = json.dumps(leaderboard, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return {PAGE_FILE: build_page(leaderboard, pictures, viewer), DATA_FILE: data + "\n"}
+
+
+def write_page(leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], folder: Path) -> int:
+    """Writes a page and its data, the page last; returns its bytes."""
+    texts = page_texts(leaderboard, pictures, folder)
+    for name in (DATA_FILE, PAGE_FILE):
+        with atomic_file(folder / name) as temporary:
+            temporary.write_text(texts[name], encoding="utf-8")
+    return len(texts[PAGE_FILE].encode("utf-8"))
 
 
 def _check_output(folder: Path) -> None:

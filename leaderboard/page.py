@@ -1,7 +1,8 @@
-"""The leaderboard as one static HTML page: no external request, no framework, readable without scripts.
+"""The leaderboard as a static page in one folder: no external request, readable without scripts.
 
-This module picks and groups what the page shows; ``templates/`` write it. Everything that a template prints is escaped
-(Jinja2 with autoescape), and what is no text is made visible, so nothing here needs to be.
+This module picks and groups what the page shows; ``templates/`` write it, and its script draws :mod:`chart_data` with
+Observable Plot, which lies in ``vendor/``. Everything that a template prints is escaped (Jinja2 with autoescape), and what is
+no text is made visible, so nothing here needs to be.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ import base64
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import jinja2
+from markupsafe import Markup
 
 from tslam_bench import constants
 from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, interval, means, number
@@ -23,11 +25,10 @@ from tslam_bench.scoring.info import OBJECT_SETS
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.text import visible
 
-from .charts import Axis, Chart, Line, line_chart, line_style
+from .chart_data import chart_data
+from .explorers import Explorer, group_explorers
 from .pictures import TOUCHED_AS_THEY_ARE
-
-Images = Mapping[tuple[str, str, str], bytes]
-"""(kind, content hash, object) -> WebP; the hash is empty for the true mesh."""
+from .shown import Key, Shown
 
 OPEN_OBJECTS: Final = 2
 """Objects of the gallery that are unfolded when the page opens."""
@@ -35,44 +36,47 @@ MOST_AUTHORS: Final = 4
 """Authors of an entry that are named."""
 COUNTS: Final = tuple(RECONSTRUCTED_POSES)
 """Numbers of poses that are reported."""
+TIERS: Final = {
+    "reported": "nothing was replayed: touches are the submitter's word",
+    "replayed": "the actions were simulated again: touches and exploration figures are the replay's",
+}
+"""Tier of an entry -> what it means, from the least to the most trustworthy."""
+VIEWS: Final = {
+    "main": (*(figure for figure in FIGURES if figure.metric == "iou"), EXPLORATION_AREA),
+    "surface": tuple(f for f in FIGURES if f.metric.startswith(("calibration", "chamfer", "normal", "f_score"))),
+    "touch": tuple(f for f in FIGURES if f.metric in ("surface_iou", "touched_surface_recall")),
+}
+"""Sets of columns -> figures: all that every table has."""
+HEAT_FIGURES: Final = (IOU_AREA, *VIEWS["main"])
+"""What the map of objects can show; the first one at the start."""
+_SCRIPTS: Final = ("vendor/d3.min.js", "vendor/plot.umd.min.js", "templates/tables.js", "templates/charts.js")
 
 
-@dataclass
-class Explorer:
-    """Entries that share their rollouts: one row of the gallery, one line of the charts."""
-
-    label: str
-    privileged: bool
-    colour: int = 0
-    entries: list[dict[str, Any]] = field(default_factory=list)
-
-    @property
-    def style(self) -> str:
-        """Classes of the style sheet for its lines."""
-        return line_style(self.colour, self.privileged)
-
-    @property
-    def curve(self) -> list[float]:
-        """Mean touched-surface recall every few steps; empty for a reference without rollouts."""
-        return self.entries[0]["recall_curve"]
-
-
-def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
+def build_page(
+    leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], viewer: Container[tuple[str, str]] = ()
+) -> str:
     """The page's HTML.
 
     Args:
         leaderboard: what :func:`tslam_bench.leaderboard.ranking.rank` returned.
-        images: pictures by kind, submission and object; what is missing is shown as missing.
+        pictures: those beside the page; what is missing is shown as missing.
+        viewer: (content hash, object) of what ``viewer.html`` beside the page can show.
     """
     boards = leaderboard["tables"]
+    tables = [_table_view(number, table, leaderboard, pictures, viewer) for number, table in enumerate(boards, start=1)]
     return _page_template().render(
         board=leaderboard,
-        tables=[_table_view(number, table, leaderboard, images) for number, table in enumerate(boards, start=1)],
-        teaser=_teaser(boards, images),
+        tables=tables,
+        training=leaderboard["training"],
+        scripts=[_script(name) for name in _SCRIPTS],
+        charts=_visible(chart_data(leaderboard, [table["explorers"] for table in tables], HEAT_FIGURES)),
+        teaser=_teaser(boards, pictures),
         constants=constants,
         counts=COUNTS,
         seconds={count: round(count * constants.HORIZON * constants.CONTROL_STEP_SECONDS) for count in COUNTS},
-        figures=FIGURES,
+        views=VIEWS,
+        heat_figures=HEAT_FIGURES,
+        tiers=TIERS,
         iou_area=IOU_AREA,
         exploration_area=EXPLORATION_AREA,
         touched_as_they_are=TOUCHED_AS_THEY_ARE,
@@ -80,25 +84,22 @@ def build_page(leaderboard: Mapping[str, Any], images: Images) -> str:
     )
 
 
-def group_explorers(entries: Sequence[dict[str, Any]]) -> list[Explorer]:
-    """Explorers in the order of their best entry; entries of one explorer name and one exploration curve belong together.
+def row_names(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What each entry is called in its row: its method, or its explorer where the method only joins explorer and reconstructor.
 
-    One that only claims the name of a baseline is another, whatever its curve.
+    Rows that would read alike get the beginning of their content hash.
     """
-    explorers: dict[tuple[str, bool, tuple[float, ...]], Explorer] = {}
+    names = []
     for entry in entries:
-        name = entry["submission"]["explorer"]
-        key = (name, entry["claimed"], tuple(entry["recall_curve"]))
-        if key not in explorers:
-            taken = any(known == name and not claimed for known, claimed, _ in explorers)
-            label = f"{name} ({entry['submission']['method']})" if taken or entry["claimed"] else name
-            explorers[key] = Explorer(label, entry["submission"]["privileged"])
-        explorers[key].entries.append(entry)
-    found = list(explorers.values())
-    # Ranked explorers first: where colours run out, a dashed line shares the colour of a plain one.
-    for colour, explorer in enumerate(sorted(found, key=lambda e: e.privileged)):
-        explorer.colour = colour
-    return found
+        info = entry["submission"]
+        joined = info["method"] in (info["explorer"], f"{info['explorer']} + {info['reconstructor']}")
+        names.append(info["explorer"] if joined else info["method"])
+    rows = [(name, entry["submission"]["reconstructor"]) for name, entry in zip(names, entries, strict=True)]
+    count = Counter(rows)
+    return [
+        f"{row[0]} ({entry['content_hash'][:6]})" if count[row] > 1 else row[0]
+        for row, entry in zip(rows, entries, strict=True)
+    ]
 
 
 # --- What the templates are given ------------------------------------------------------------------------------
@@ -120,7 +121,6 @@ def _page_template() -> jinja2.Template:
         "hours": lambda hours: f"{60 * hours:.0f} min" if hours < 1 else f"{hours:.1f} h",
         "thousands": "{:,}".format,
         "listed": lambda values: f"{', '.join(map(str, values[:-1]))} and {values[-1]}",
-        "data_uri": lambda image: f"data:image/webp;base64,{base64.b64encode(image).decode('ascii')}",
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii"),
         "people": lambda names: (
             ", ".join(names[:MOST_AUTHORS])
@@ -128,11 +128,30 @@ def _page_template() -> jinja2.Template:
         ),
         "web_address": lambda link: link if re.match("https?://", link) else "",
     }
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": True}
     return environment.get_template("page.html.jinja")
 
 
+def _script(name: str) -> Markup:
+    """A script of this package as it stands; the policy of the page holds its hash."""
+    return Markup((Path(__file__).parent / name).read_text(encoding="utf-8"))
+
+
+def _visible(value: Any) -> Any:
+    """The same plain value with :func:`visible` texts: a script shows them without the templates' help."""
+    if isinstance(value, str):
+        return visible(value)
+    if isinstance(value, dict):
+        return {key: _visible(item) for key, item in value.items()}
+    return [_visible(item) for item in value] if isinstance(value, list | tuple) else value
+
+
 def _table_view(
-    number: int, table: Mapping[str, Any], leaderboard: Mapping[str, Any], images: Images
+    number: int,
+    table: Mapping[str, Any],
+    leaderboard: Mapping[str, Any],
+    pictures: Mapping[Key, Shown],
+    viewer: Container[tuple[str, str]],
 ) -> dict[str, Any]:
     """One ranking with its charts and its gallery."""
     entries = table["entries"]
@@ -141,9 +160,12 @@ def _table_view(
     kind = table["object_set"] if table["object_set"] in OBJECT_SETS else "chosen"
     count = len(table["objects"])
     set_name = f"{count} {kind} object{'' if count == 1 else 's'}"
-    recall_chart = _recall_chart([e for e in explorers if e.curve], leaderboard["curve_spacing"])
-    pictured = [name for name in table["objects"] if ("truth", "", name) in images]
-    present = {"ranking": True, "exploration": recall_chart is not None, "objects": True, "gallery": bool(pictured)}
+    shown = [
+        name
+        for name in table["objects"]
+        if ("truth", "", name) in pictures or any((entry["content_hash"], name) in viewer for entry in entries)
+    ]
+    present = {"ranking": True, "curves": True, "objects": True, "gallery": bool(shown)}
     return {
         "number": number,
         "set_name": set_name,
@@ -153,21 +175,30 @@ def _table_view(
                 "title": name.capitalize() + (f" ({set_name})" if len(leaderboard["tables"]) > 1 else ""),
                 "template": f"{name}.html.jinja",
             }
-            for name, shown in present.items()
-            if shown
+            for name, there in present.items()
+            if there
         ],
         "object_set": table["object_set"],
         "objects": table["objects"],
-        "entries": entries,
+        "rows": [
+            {"name": name, "entry": entry, "explorer": next(e for e in explorers if entry in e.entries)}
+            for name, entry in zip(row_names(entries), entries, strict=True)
+        ],
         "explorers": explorers,
         "reconstructors": reconstructors,
-        "recall_chart": recall_chart,
-        "iou_charts": _iou_charts(explorers, reconstructors),
-        "gallery": [_gallery_object(name, entries, explorers, reconstructors, images) for name in pictured],
+        "charted": _charted(explorers),
+        "tiers": [tier for tier in TIERS if any(entry["tier"] == tier for entry in entries)],
+        "gallery": [_gallery_object(name, entries, explorers, reconstructors, pictures, viewer) for name in shown],
     }
 
 
-def _teaser(tables: Sequence[Mapping[str, Any]], images: Images) -> dict[str, Any] | None:
+def _charted(explorers: Sequence[Explorer]) -> list[str]:
+    """Reconstructors of more than one explorer: their IoU is drawn."""
+    count = Counter(entry["submission"]["reconstructor"] for explorer in explorers for entry in explorer.entries)
+    return sorted(name for name, entries in count.items() if entries > 1)
+
+
+def _teaser(tables: Sequence[Mapping[str, Any]], pictures: Mapping[Key, Shown]) -> dict[str, Any] | None:
     """What was felt, rebuilt and true, of the best ranked entry and the object it rebuilt best among those pictured."""
     for table in tables:
         for entry in sorted(table["entries"], key=lambda e: e["rank"] or math.inf):
@@ -175,64 +206,38 @@ def _teaser(tables: Sequence[Mapping[str, Any]], images: Images) -> dict[str, An
             shown = {}
             for name in table["objects"]:
                 wanted = (("touched", key, name), ("reconstruction", key, name), ("truth", "", name))
-                if all(picture in images for picture in wanted):
-                    shown[name] = [images[picture] for picture in wanted]
+                if all(picture in pictures for picture in wanted):
+                    shown[name] = [pictures[picture] for picture in wanted]
             if shown:
                 name = max(shown, key=lambda name: _iou_at_8(entry, name))
                 return {"name": name, "entry": entry, "iou": _iou_at_8(entry, name), "pictures": shown[name]}
     return None
 
 
-def _recall_chart(explorers: Sequence[Explorer], spacing: int) -> Chart | None:
-    """Recall against control steps of the explorers that have rollouts."""
-    if not explorers:
-        return None
-    total = spacing * (len(explorers[0].curve) - 1)
-    steps = range(0, total + 1, constants.HORIZON)
-    return line_chart(
-        "Touched-surface recall against control steps",
-        [
-            Line(e.label, e.colour, [(spacing * k, v) for k, v in enumerate(e.curve)], dashed=e.privileged)
-            for e in explorers
-        ],
-        Axis(f"control steps; a new pose every {constants.HORIZON}", 0, total, [(step, str(step)) for step in steps]),
-        Axis("touched-surface recall", 0, 1, _fifths(1)),
-    )
-
-
-def _iou_charts(explorers: Sequence[Explorer], reconstructors: Sequence[str]) -> dict[str, Chart]:
-    """IoU against the number of poses: a chart for each reconstructor of more than one entry, all on one scale."""
-    lines: dict[str, list[Line]] = {name: [] for name in reconstructors}
-    for explorer in explorers:
-        for entry in explorer.entries:
-            points = [(float(k), entry["aggregate"][str(n)]["iou"]["mean"]) for k, n in enumerate(COUNTS)]
-            line = Line(explorer.label, explorer.colour, points, dashed=explorer.privileged)
-            lines[entry["submission"]["reconstructor"]].append(line)
-    highest = max(iou for drawn in lines.values() for line in drawn for _, iou in line.points)
-    top = max(0.2, math.ceil(5 * highest - 1e-9) / 5)
-    x = Axis("poses", -0.15, len(COUNTS) - 0.85, [(k, str(n)) for k, n in enumerate(COUNTS)])
-    y = Axis("IoU", 0, top, _fifths(top))
-    return {
-        name: line_chart(f"IoU against poses, reconstructor {name}", drawn, x, y, (340, 250), False, True)
-        for name, drawn in lines.items()
-        if len(drawn) > 1
-    }
-
-
 def _gallery_object(
-    name: str, entries: Sequence[Any], explorers: Sequence[Explorer], reconstructors: Sequence[str], images: Images
+    name: str,
+    entries: Sequence[Any],
+    explorers: Sequence[Explorer],
+    reconstructors: Sequence[str],
+    pictures: Mapping[Key, Shown],
+    viewer: Container[tuple[str, str]],
 ) -> dict[str, Any]:
     """Pictures of one object: a row for each explorer, with the reconstructions of its touches."""
     ranked = [entry for entry in entries if entry["rank"] is not None]
     best = max(ranked or entries, key=lambda entry: _iou_at_8(entry, name))
     rows = []
     for explorer in explorers:
-        touched = (images.get(("touched", entry["content_hash"], name)) for entry in explorer.entries)
+        touched = (pictures.get(("touched", entry["content_hash"], name)) for entry in explorer.entries)
         cells: dict[str, list[dict[str, Any]]] = {r: [] for r in reconstructors if r != TOUCHED_AS_THEY_ARE}
         for entry in explorer.entries:
             if entry["submission"]["reconstructor"] in cells:
-                image = images.get(("reconstruction", entry["content_hash"], name))
-                cells[entry["submission"]["reconstructor"]].append({"image": image, "iou": _iou_at_8(entry, name)})
+                cells[entry["submission"]["reconstructor"]].append(
+                    {
+                        "image": pictures.get(("reconstruction", entry["content_hash"], name)),
+                        "iou": _iou_at_8(entry, name),
+                        "entry": entry["content_hash"] if (entry["content_hash"], name) in viewer else "",
+                    }
+                )
         rows.append(
             {
                 "explorer": explorer,
@@ -243,7 +248,7 @@ def _gallery_object(
         )
     return {
         "name": name,
-        "truth": images["truth", "", name],
+        "truth": pictures.get(("truth", "", name)),
         "best": best,
         "best_iou": _iou_at_8(best, name),
         "rows": rows,
@@ -252,8 +257,3 @@ def _gallery_object(
 
 def _iou_at_8(entry: Mapping[str, Any], name: str) -> float:
     return entry["per_object"][name]["8"]["iou"]
-
-
-def _fifths(top: float) -> list[tuple[float, str]]:
-    """Ticks at 0, 0.2, ... up to ``top``."""
-    return [(k / 5, f"{k / 5:.1f}") for k in range(round(5 * top) + 1)]

@@ -9,7 +9,7 @@ score puts them, without a rank, and lead no group.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -17,23 +17,26 @@ import numpy as np
 from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
 from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.objects.splits import object_set
-from tslam_bench.scoring.aggregate import interval, probability_of_improvement, resampled_means
+from tslam_bench.scoring.aggregate import curve_intervals, interval, probability_of_improvement, resampled_means
 from tslam_bench.scoring.score_file import CURVE_SPACING, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.version import __version__
 
-LEADERBOARD_VERSION: Final = 3
-"""Version of the layout of leaderboard.json."""
+LEADERBOARD_VERSION: Final = 4
+"""Version of the layout of leaderboard.json. 4: tiers, bands of the curves, training records."""
+DIGITS: Final = 7
+"""Significant digits of the figures: sums of other processors differ only beyond them."""
 REFERENCE_EXPLORER: Final = "heuristic"
 """Explorer over which the probability of improvement is given."""
 RESERVED: Final = frozenset(spec.id for spec in list_baselines() if spec.kind != "own")
 """Ids of the benchmark's own explorers."""
 
 
-def rank(scores: Sequence[SubmissionScore]) -> dict[str, Any]:
+def rank(scores: Sequence[SubmissionScore], training: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """The content of leaderboard.json.
 
     Args:
+        training: records of trained policies (:func:`tslam_bench.leaderboard.training.read_records`).
         scores: scored submissions; of several with the same files, the most trustworthy one is kept, in whatever order they come.
 
     Returns:
@@ -46,7 +49,7 @@ def rank(scores: Sequence[SubmissionScore]) -> dict[str, Any]:
         groups.setdefault(tuple(sorted(score.objects)), []).append(score)
     # The largest set of objects first.
     tables = [_table(group) for _, group in sorted(groups.items(), key=lambda item: (-len(item[0]), item[0]))]
-    return {
+    board = {
         "leaderboard_version": LEADERBOARD_VERSION,
         "protocol_version": PROTOCOL_VERSION,
         "package_version": __version__,
@@ -54,7 +57,9 @@ def rank(scores: Sequence[SubmissionScore]) -> dict[str, Any]:
         "reference_explorer": REFERENCE_EXPLORER,
         "curve_spacing": CURVE_SPACING,
         "tables": tables,
+        "training": list(training),
     }
+    return _rounded(board)
 
 
 def _table(group: Sequence[SubmissionScore]) -> dict[str, Any]:
@@ -126,6 +131,7 @@ def _entry(
     return {
         **{name: written[name] for name in ("submission", "content_hash", "verified", "aggregate", "notes")},
         "claimed": _claimed(score),
+        "tier": "replayed" if score.verified else "reported",
         "rank": position,
         "behind_leader": difference,
         "improvement": _improvement(score, group),
@@ -137,6 +143,7 @@ def _entry(
             for name, rows in results.items()
         },
         "recall_curve": _mean_curve([r.recall_curve for r in score.results]),
+        "recall_band": _band(score),
         "surface_iou_curve": _mean_curve([r.surface_iou_curve for r in score.results]),
     }
 
@@ -180,3 +187,21 @@ def _mean_curve(curves: Sequence[Sequence[float]]) -> list[float]:
     if not curves or not all(curves):
         return []
     return [round(float(value), 5) for value in np.mean(np.array(curves), axis=0)]
+
+
+def _band(score: SubmissionScore) -> dict[str, list[float]]:
+    """95 % interval of the mean recall at every point of the curve; empty for a reference without rollouts."""
+    curves = [result.recall_curve for result in score.results]
+    if not curves or not all(curves):
+        return {"low": [], "high": []}
+    low, high = curve_intervals(np.array(curves).reshape(len(score.objects), -1, len(curves[0])))
+    return {"low": [round(float(x), 5) for x in low], "high": [round(float(x), 5) for x in high]}
+
+
+def _rounded(value: Any) -> Any:
+    """The same plain value, its numbers with ``DIGITS`` significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import os
 import re
@@ -13,17 +14,20 @@ import zipfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+from PIL import Image
 from scored_run import NAMES, fake_score
 
 from tslam_bench.cli import main
 from tslam_bench.cli.score import score_main
 from tslam_bench.errors import AssetError, InvalidInputError
-from tslam_bench.leaderboard.commands import find_inputs, page_main
-from tslam_bench.leaderboard.page import build_page
+from tslam_bench.leaderboard.commands import find_inputs, page_main, write_page
+from tslam_bench.leaderboard.page import build_page, row_names
 from tslam_bench.leaderboard.ranking import rank
+from tslam_bench.leaderboard.shown import Shown, read_pictures, write_pictures
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.origin import beside, has_origin, write_origin
 from tslam_bench.scoring.submission import read_submission
@@ -71,17 +75,29 @@ def page(run: Path, primitive_cache: Path, tmp_path_factory: pytest.TempPathFact
     return output
 
 
-def test_page_is_well_formed_and_self_contained(page: Path) -> None:
+def markup(page: Path) -> str:
+    """The page without what its script reads: figures stand there as well."""
     text = (page / "index.html").read_text(encoding="utf-8")
+    return re.sub(r'<script type="application/json".*?</script>', "", text, flags=re.DOTALL)
+
+
+def test_page_is_well_formed_and_complete_in_its_folder(page: Path) -> None:
+    text = markup(page)
     parsed = Page(text)
     images = parsed.all("img")
     # Truth, touched and reconstruction of two objects; random + grid shows touched voxels only; three in the header.
     assert len(images) == 3 + 2 * (1 + 4 + 3)
-    assert all(image["src"].startswith("data:image/webp;base64,") and image["alt"] for image in images)  # type: ignore[union-attr]
+    assert all(image["alt"] and image["loading"] == "lazy" for image in images)
+    for image in images:
+        with Image.open(page / (image["src"] or "")) as picture:
+            assert picture.format == "WEBP" and picture.size == (int(image["width"] or 0), int(image["height"] or 0))
+    pictures = {path.name for path in (page / "pictures").glob("*.webp")}
+    assert pictures == {(image["src"] or "").removeprefix("pictures/") for image in images}
     for attributes in [*parsed.all("link"), *parsed.all("script"), *parsed.all("img")]:
         address = attributes.get("href") or attributes.get("src") or ""
         assert not address.startswith(("http", "//"))
-    assert "@import" not in text and "url(" not in text
+    own = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert "@import" not in own and "url(" not in own
     headers = parsed.all("th")
     assert headers and all(attributes.get("scope") in ("row", "col") for attributes in headers)
     identifiers = [attributes["id"] for _, attributes in parsed.tags if "id" in attributes]
@@ -106,7 +122,8 @@ def page_with(text: str, link: str) -> str:
     board = rank(scores)
     table = board["tables"][0]
     table["objects"] = [name + text for name in table["objects"]]
-    images = {("truth", "", name): b"truth" for name in table["objects"]}
+    images = {("truth", "", name): Shown("a.webp", 2, 1) for name in table["objects"]}
+    viewer = {(entry["content_hash"], name) for entry in table["entries"] for name in table["objects"]}
     for number, entry in enumerate(table["entries"]):
         names = {"explorer": f"{number}{text}", "reconstructor": text, "method": text, "label": text, "link": link}
         entry["submission"] |= {**names, "authors": [text, text], "contact": text, "package_version": text}
@@ -114,10 +131,10 @@ def page_with(text: str, link: str) -> str:
         entry["notes"] = [text]
         entry["per_object"] = {name + text: value for name, value in entry["per_object"].items()}
         for name in table["objects"]:
-            images["touched", entry["content_hash"], name] = images["reconstruction", entry["content_hash"], name] = (
-                b"x"
-            )
-    return build_page(board, images)
+            for kind in ("touched", "reconstruction"):
+                images[kind, entry["content_hash"], name] = Shown("b.webp", 2, 1)
+    board["training"] = [{"explorer": text, "runs": 1, "steps": [1], "mean": [1.0], "low": [1.0], "high": [1.0]}]
+    return build_page(board, images, viewer)
 
 
 def test_no_text_of_a_submission_becomes_markup() -> None:
@@ -126,8 +143,11 @@ def test_no_text_of_a_submission_becomes_markup() -> None:
     shapes = [[(tag, sorted(attributes)) for tag, attributes in Page(text).tags] for text in (harmless, hostile)]
     assert shapes[0] == shapes[1]
     scripts = [re.findall(r"<script>(.*?)</script>", text, re.DOTALL) for text in (harmless, hostile)]
-    assert scripts[0] == scripts[1] and len(scripts[0]) == 1
-    assert all(not value.startswith("javascript:") for a in Page(hostile).all("a") if (value := a["href"] or ""))
+    assert scripts[0] == scripts[1] and len(scripts[0]) == 4
+    assert all((a["href"] or "").startswith(("#", "viewer.html?", "leaderboard.json")) for a in Page(hostile).all("a"))
+    (data,) = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', hostile, re.DOTALL)
+    assert not set("<>&'") & set(data)
+    assert {line["label"] for line in json.loads(data)["tables"][0]["iou"]} == {f"{k}{HOSTILE}" for k in range(3)}
     names = [
         attributes["data-reconstructor"] for attributes in Page(hostile).all("tr") if "data-reconstructor" in attributes
     ]
@@ -135,8 +155,10 @@ def test_no_text_of_a_submission_becomes_markup() -> None:
 
 
 def test_text_that_turns_or_hides_its_surroundings_is_shown_as_an_escape() -> None:
-    text = page_with("a\u202eb\u200bc\x1bd", "")
+    text = re.sub(r"<script>.*?</script>", "", page_with("a\u202eb\u200bc\x1bd", ""), flags=re.DOTALL)
     assert not set("\u202e\u200b\x1b") & set(text) and r"a\u202eb\u200bc\x1bd" in text
+    (data,) = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL)
+    assert json.loads(data)["training"][0]["label"] == r"a\u202eb\u200bc\x1bd"
 
 
 @pytest.mark.parametrize(
@@ -151,18 +173,36 @@ def test_a_web_address_becomes_a_link() -> None:
     assert links == 3 * ["https://example.org/?a=1&b=2"]
 
 
-def test_only_the_script_of_the_page_may_run(page: Path) -> None:
+def test_only_the_scripts_of_the_package_may_run(page: Path) -> None:
     text = (page / "index.html").read_text(encoding="utf-8")
-    (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    folder = Path(build_page.__code__.co_filename).parent
+    names = ("vendor/d3.min.js", "vendor/plot.umd.min.js", "templates/tables.js", "templates/charts.js")
+    assert scripts == [(folder / name).read_text(encoding="utf-8") for name in names]
     (policy,) = [m["content"] or "" for m in Page(text).all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
-    assert "addEventListener" in script and "&" + "gt;" not in script
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    (allowed,) = re.findall(r"script-src ([^;]*)", policy)
+    assert allowed.split() == [f"'sha256-{digest}'" for digest in digests]
+    assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} <= {
+        part.strip() for part in policy.split(";")
+    }
+
+
+def test_libraries_are_those_of_their_packages_and_carry_their_licences() -> None:
+    """SHA-256 of dist/ in d3 7.9.0 and @observablehq/plot 0.6.17 as npm has them."""
+    folder = Path(build_page.__code__.co_filename).parent / "vendor"
+    for name, digest in (
+        ("d3.min.js", "f2094bbf6141b359722c4fe454eb6c4b0f0e42cc10cc7af921fc158fceb86539"),
+        ("plot.umd.min.js", "4358086467740777dd788d6b27a95cebdbaefdd50c730a3060117073bd7134cb"),
+    ):
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    for name in ("d3", "plot"):
+        assert "Permission to use, copy, modify" in (folder / f"{name}.LICENSE").read_text(encoding="utf-8")
 
 
 def test_figures_are_written_alike_everywhere(run: Path, page: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The terminal and the page show the same text for the same figure."""
-    text = (page / "index.html").read_text(encoding="utf-8")
+    text = markup(page)
     value = json.loads((run / "scores" / "heuristic-hull.json").read_text())["aggregate"]
     score_main([str(run / "submissions" / "heuristic-hull"), "--objects", *NAMES])
     printed = capsys.readouterr().out
@@ -177,7 +217,7 @@ def test_figures_are_written_alike_everywhere(run: Path, page: Path, capsys: pyt
 
 
 def test_page_shows_the_scores(page: Path, run: Path) -> None:
-    text = (page / "index.html").read_text(encoding="utf-8")
+    text = markup(page)
     table = json.loads((page / "leaderboard.json").read_text())["tables"][0]
     assert {e["submission"]["explorer"] for e in table["entries"]} == {"heuristic", "random", "mine", "tslam_chamfer"}
     for entry in table["entries"]:
@@ -189,7 +229,7 @@ def test_page_shows_the_scores(page: Path, run: Path) -> None:
         mean = np.mean([result["areas"]["iou_area"] for result in score["results"]])
         assert entry["aggregate"]["areas"]["iou_area"]["mean"] == pytest.approx(mean)
         assert f">{mean:.3f}<" in text
-    assert "12,345" in text and "a toaster" in text and "not replayed" in text and "privileged" in text
+    assert "12,345" in text and "a toaster" in text and ">reported</span>" in text and "privileged" in text
 
 
 def test_a_record_beside_a_submission_makes_it_a_replayed_one(run: Path, tmp_path: Path) -> None:
@@ -215,18 +255,23 @@ def test_a_record_beside_a_submission_makes_it_a_replayed_one(run: Path, tmp_pat
         page_main([scores, str(folder), "--output", str(tmp_path / "page"), "--pictured", "0"])
         (entry,) = json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]
         text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
-        assert entry["verified"] is expected and (">replayed<" in text) is expected
+        assert entry["verified"] is expected and (">replayed</span>" in text) is expected
+        assert entry["tier"] == ("replayed" if expected else "reported")
         assert ("mug, pose 3, seed 0: joints depart by step 9" in text) is expected
         record_path(folder).write_text(sealed)
 
 
 def test_page_is_deterministic_and_reuses_pictures(page: Path, run: Path, tmp_path: Path) -> None:
-    before = {path.name: path.stat().st_mtime_ns for path in (page / ".pictures").iterdir()}
+    def pictures() -> dict[str, int]:
+        found = [*(page / ".pictures").iterdir(), *(page / "pictures").glob("*.webp")]
+        return {path.name: path.stat().st_mtime_ns for path in found}
+
+    before = pictures()
     text = (page / "index.html").read_bytes()
     time.sleep(0.02)
     page_main([str(run), "--output", str(page)])
     assert (page / "index.html").read_bytes() == text
-    assert {path.name: path.stat().st_mtime_ns for path in (page / ".pictures").iterdir()} == before
+    assert pictures() == before
     page_main(["--scores", str(run / "scores"), "--output", str(tmp_path)])
     assert (tmp_path / "index.html").read_bytes() == text
 
@@ -235,6 +280,48 @@ def test_page_without_submissions_has_no_pictures(run: Path, tmp_path: Path) -> 
     paths = sorted((run / "scores").glob("*.json"))
     page_main([*map(str, paths), "--output", str(tmp_path)])
     assert Page((tmp_path / "index.html").read_text(encoding="utf-8")).all("img") == []
+
+
+def test_pictures_of_an_earlier_page_go_and_the_list_says_what_is_shown(tmp_path: Path) -> None:
+    def webp(grey: int) -> bytes:
+        stream = io.BytesIO()
+        Image.new("L", (3, 2), grey).save(stream, format="WEBP")
+        return stream.getvalue()
+
+    keys = [("truth", "", "mug"), ("touched", "ab", "mug"), ("touched", "cd", "mug")]
+    first = write_pictures(dict(zip(keys, map(webp, (0, 99, 99)), strict=True)), tmp_path / "pictures")
+    assert read_pictures(tmp_path / "pictures") == first
+    assert first[keys[1]] == first[keys[2]] != first[keys[0]] and (first[keys[0]].width, first[keys[0]].height) == (
+        3,
+        2,
+    )
+    (tmp_path / "pictures" / "mine.webp").write_bytes(b"")
+    second = write_pictures({keys[0]: webp(200)}, tmp_path / "pictures")
+    names = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert names == {"mine.webp", "pictures.json", second[keys[0]].file}
+    (tmp_path / "pictures" / second[keys[0]].file).unlink()
+    with pytest.raises(InvalidInputError, match="is not there"):
+        read_pictures(tmp_path / "pictures")
+    assert read_pictures(tmp_path / "nothing") == {} == write_pictures({}, tmp_path / "nothing")
+
+
+def test_the_viewer_is_linked_where_it_is(page: Path, run: Path, tmp_path: Path) -> None:
+    assert "viewer.html" not in markup(page)
+    board, pictures = json.loads((page / "leaderboard.json").read_text()), read_pictures(page / "pictures")
+    (tmp_path / "viewer.html").touch()
+    write_page(board, pictures, tmp_path)
+    links = [urlsplit(a["href"] or "") for a in Page(markup(tmp_path)).all("a") if "viewer" in (a["href"] or "")]
+    assert {link.path for link in links} == {"viewer.html"}
+    found = {(q["entry"][0], q["object"][0]) for q in (parse_qs(link.query) for link in links)}
+    entries = [e for e in board["tables"][0]["entries"] if e["submission"]["reconstructor"] != "grid"]
+    assert found == {(entry["content_hash"], name) for entry in entries for name in NAMES}
+
+
+def test_rows_that_would_read_alike_are_told_apart() -> None:
+    scores = [fake_score(name, [0.2 + k / 10], method="Mine") for k, name in enumerate(("a", "b"))]
+    scores += [fake_score("c", [0.5], method="Mine", reconstructor="grid"), fake_score("d", [0.6])]
+    entries = rank(scores)["tables"][0]["entries"]
+    assert row_names(entries) == ["d", "Mine", f"Mine ({entries[2]['content_hash'][:6]})", "Mine (a-hull)"]
 
 
 def test_page_of_fake_scores_with_missing_figures() -> None:
@@ -330,7 +417,7 @@ def test_a_forged_score_file_beside_its_submission_counts_nothing(run: Path, tmp
         (entry,) = json.loads((tmp_path / "page" / "leaderboard.json").read_text())["tables"][0]["entries"]
         text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
         assert entry["aggregate"]["areas"]["iou_area"]["mean"] == pytest.approx(mean)
-        assert entry["verified"] is False and ">replayed<" not in text
+        assert entry["verified"] is False and ">replayed</span>" not in text
         assert ("scored elsewhere" in text) is remark
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scored_run import fake_score
 
-from tslam_bench.leaderboard.page import group_explorers
+from tslam_bench.leaderboard.explorers import group_explorers
 from tslam_bench.leaderboard.ranking import rank
 from tslam_bench.scoring.aggregate import interval, resampled_means
 from tslam_bench.scoring.score_file import SubmissionScore

@@ -8,9 +8,12 @@ from scipy.stats import mannwhitneyu, norm, trim_mean
 
 from tslam_bench.scoring.aggregate import (
     Bootstrap,
+    curve_intervals,
     estimate_all,
     interquartile_mean,
+    interval,
     probability_of_improvement,
+    resampled_means,
 )
 
 
@@ -90,3 +93,11 @@ def test_probability_of_improvement_is_mann_whitney() -> None:
 def test_probability_of_improvement_refuses_other_objects() -> None:
     with pytest.raises(ValueError, match="other objects"):
         probability_of_improvement(np.zeros((3, 1)), np.zeros((4, 1)))
+
+
+def test_intervals_of_curves_are_those_of_each_point() -> None:
+    curves = np.random.default_rng(0).random((7, 3, 5)).cumsum(axis=2)
+    low, high = curve_intervals(curves)
+    for point in range(5):
+        expected = interval(resampled_means(curves[:, :, point]))
+        assert (low[point], high[point]) == pytest.approx(expected, rel=1e-12)

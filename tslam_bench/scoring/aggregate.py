@@ -64,6 +64,12 @@ class Bootstrap:
             raise ValueError(f"bootstrap: values have shape {values.shape}, expected {self.shape}")
         return values[self._object, self._seed]
 
+    def weights(self) -> NDArray[np.float64]:
+        """How much each value counts in the mean of each resample: (samples, objects * seeds), every row sums to 1."""
+        samples, size = len(self._object), self.shape[0] * self.shape[1]
+        drawn = (self._object * self.shape[1] + self._seed).reshape(samples, size) + size * np.arange(samples)[:, None]
+        return np.bincount(drawn.ravel(), minlength=samples * size).reshape(samples, size) / size
+
     def estimate(self, values: NDArray) -> Estimate:
         """Mean and interquartile mean of ``values`` (objects, seeds) with percentile intervals."""
         values = np.asarray(values, dtype=np.float64)
@@ -88,6 +94,18 @@ def resampled_means(values: NDArray, samples: int = BOOTSTRAP_SAMPLES) -> NDArra
     """
     objects, seeds = np.shape(values)
     return Bootstrap(objects, seeds, samples).resample(values).mean(axis=(1, 2))
+
+
+def curve_intervals(curves: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """95 % intervals of the mean of ``curves`` (objects, seeds, points), point by point: low (points,), high (points,).
+
+    The resamples are those of :func:`resampled_means`.
+    """
+    objects, seeds, points = np.shape(curves)
+    drawn = Bootstrap(objects, seeds).weights() @ np.reshape(curves, (objects * seeds, points))
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(drawn, [tail, 100 - tail], axis=0)
+    return low, high
 
 
 def interval(samples: NDArray, confidence: float = CONFIDENCE) -> tuple[float, float]:

@@ -22,6 +22,9 @@ from tslam_bench.reconstruction.registry import list_reconstructors, make_recons
 from tslam_bench.reconstruction.training_config import TrainingConfig
 
 
+_SIMULATED_STREAM = 4  # keeps the simulated touches apart from other uses of the seed
+
+
 @dataclass(frozen=True)
 class List:
     """Name the reconstructors."""
@@ -55,6 +58,35 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Collect:
+    """Let explorers and a simulation feel prepared objects, for `reconstruct train --data`.
+
+    Writes OUTPUT/<policy>/<object>.npz and OUTPUT/simulated/<object>.npz; files that exist are kept.
+    """
+
+    output: Path
+    """Folder to write."""
+    policies: tuple[str, ...] = ("heuristic", "random_targets")
+    """Explorers: ids (tslam-bench baselines list), or your own as module:Class or path/to/file.py:Class."""
+    model: Path | None = None
+    """Trained model, if there is one explorer and it needs one."""
+    folder: str | None = None
+    """Name of the folder instead of the explorer's, if there is one explorer."""
+    repetitions: int = 1
+    """Episodes per explorer, object and pose."""
+    simulated: int = 8
+    """Simulated explorations per object; 0 makes none."""
+    split: str = "train"
+    """Split of the objects; not test."""
+    objects: tuple[str, ...] = ()
+    """These of its prepared objects; all of them if not given."""
+    seed: int = 0
+    """Seed of the simulated touches."""
+    processes: int | None = None
+    """Worker processes of the simulation; the cores if not given."""
+
+
+@dataclass(frozen=True)
 class Run:
     """Reconstruct a shape from touched and visited grids, and write it as a mesh or a probability grid."""
 
@@ -80,7 +112,7 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
         BenchmarkError: bad input; the message is one line.
     """
-    commands = {"list": (List, _list), "train": (Train, _train), "run": (Run, _run)}
+    commands = {"list": (List, _list), "collect": (Collect, _collect), "train": (Train, _train), "run": (Run, _run)}
     about = "From touched and visited grids to a shape."
     run_command("tslam-bench reconstruct", about, commands, arguments)
 
@@ -95,6 +127,41 @@ def _list(parsed: List) -> None:
     widths = [max(len(row[i]) for row in rows) for i in range(3)]
     for row in rows:
         print("  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]]))
+
+
+def _collect(parsed: Collect) -> None:
+    from tslam_bench.evaluation.collect import collect_episodes
+    from tslam_bench.objects.store import load_object
+    from tslam_bench.reconstruction.touch_data import SIMULATED_FOLDER, explored_file, simulate_object
+    from tslam_bench.reconstruction.training_objects import training_names
+
+    if (parsed.model or parsed.folder) and len(parsed.policies) != 1:
+        raise InvalidInputError(f"--model and --folder are of one explorer; {len(parsed.policies)} are given")
+    if parsed.repetitions < 1 or parsed.simulated < 0:
+        raise InvalidInputError("--repetitions must be at least 1, and --simulated at least 0")
+    names = training_names(parsed.split, None, parsed.objects)
+    for policy in parsed.policies:
+        folder = parsed.output / (parsed.folder or policy_folder(policy))
+        with Progress(f"explore with {policy}", "object", len(names)) as bar:
+            collect_episodes(
+                policy, names, parsed.split, folder, parsed.model, parsed.repetitions, parsed.processes, bar.show
+            )
+    if parsed.simulated:
+        folder = parsed.output / SIMULATED_FOLDER
+        with Progress("simulate touches", "object", len(names)) as bar:
+            for index, name in enumerate(names):
+                if not explored_file(folder, name).is_file():
+                    generator = np.random.Generator(np.random.PCG64([parsed.seed, _SIMULATED_STREAM, index]))
+                    simulate_object(load_object(name, parsed.split), parsed.simulated, generator).save(folder, name)
+                bar.show(index + 1)
+    print(f"{parsed.output}: {len(names)} objects of {parsed.split}")
+
+
+def policy_folder(policy: str) -> str:
+    """A folder's name for an id, ``module:Class`` or ``file.py:Class``."""
+    from tslam_bench.evaluation.policies import get_baseline
+
+    return get_baseline(policy).id
 
 
 def _train(parsed: Train) -> None:

@@ -21,7 +21,6 @@ from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
 from tslam_bench.reconstruction.training_config import TrainingConfig
 
-
 _SIMULATED_STREAM = 4  # keeps the simulated touches apart from other uses of the seed
 
 
@@ -43,6 +42,8 @@ class Train:
     config: tyro.conf.OmitArgPrefixes[TrainingConfig]
     output: Path
     """Checkpoint to write."""
+    data: Path | None = None
+    """Folder of collected touches (tslam-bench reconstruct collect); without one, touches are simulated as it goes."""
     split: str = "train"
     """Split to learn from."""
     count: int | None = None
@@ -165,7 +166,7 @@ def policy_folder(policy: str) -> str:
 
 
 def _train(parsed: Train) -> None:
-    from tslam_bench.reconstruction.learned import network_config
+    from tslam_bench.reconstruction.learned import LearnedReconstructor, network_config
     from tslam_bench.reconstruction.training import train
     from tslam_bench.reconstruction.training_objects import load_training_shapes, training_names
 
@@ -173,6 +174,13 @@ def _train(parsed: Train) -> None:
     config.check()
     network_config(config.architecture, config.size)
     names = training_names(parsed.split, parsed.count, parsed.objects)
+    if parsed.data is not None:
+        _train_on_data(parsed, names)
+        return
+    if config.architecture == "unet":
+        raise InvalidInputError(
+            "unet: learns from collected touches; give --data FOLDER (tslam-bench reconstruct collect)"
+        )
     try:
         held_out = training_names(parsed.threshold_split, None, parsed.threshold_objects)
     except AssetError:
@@ -192,11 +200,30 @@ def _train(parsed: Train) -> None:
 
         reconstructor = train(shapes, config, parsed.output, parsed.log, threshold_shapes, show)
         bar.show(config.steps)
-    assert reconstructor is not None  # only `stop` ends a run early
+    assert isinstance(reconstructor, LearnedReconstructor)  # None is of runs that are stopped, the other kind of --data
     print(
         f"{parsed.output}: {config.architecture}, {config.steps} steps on {len(shapes)} objects, "
         f"threshold {reconstructor.threshold:.2f}"
     )
+
+
+def _train_on_data(parsed: Train, names: Sequence[str]) -> None:
+    from tslam_bench.objects.store import load_object
+    from tslam_bench.reconstruction.touch_data import load_touch_data
+    from tslam_bench.reconstruction.training import train
+
+    assert parsed.data is not None
+    config = parsed.config
+    with Progress("read collected touches", "object", len(names)) as bar:
+        data = load_touch_data(parsed.data, [load_object(name, parsed.split) for name in names], bar.show)
+    with Progress(f"train {config.architecture}", "step", config.steps) as bar:
+
+        def show(done: int, loss: float) -> None:
+            bar.show(done, note="" if math.isnan(loss) else f"loss {loss:.4f}")
+
+        train(data, config, parsed.output, parsed.log, None, show)
+        bar.show(config.steps)
+    print(f"{parsed.output}: {config.architecture}, {config.steps} steps on {len(data)} objects")
 
 
 def _run(parsed: Run) -> None:

@@ -87,9 +87,7 @@ def collect_episodes(
     mode = baseline.control_mode
     width = _OBJECTS_AT_ONCE * NUM_POSES
     envs = FirstSteps(
-        make_vec(
-            ENVIRONMENT_ID, width, "cpu", objects=missing, split=split, control_mode=mode, processes=processes
-        )
+        make_vec(ENVIRONMENT_ID, width, "cpu", objects=missing, split=split, control_mode=mode, processes=processes)
     )
     try:
         for begin in range(0, len(missing), _OBJECTS_AT_ONCE):

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,19 +17,23 @@ from tslam_bench.constants import GRID_SIZE, OCCUPANCY_THRESHOLD
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file
 from tslam_bench.grids import voxel_centres
-from tslam_bench.reconstruction import convonet, ifnet
+from tslam_bench.reconstruction import convonet, ifnet, unet
+from tslam_bench.reconstruction.dense import DenseReconstructor
 from tslam_bench.reconstruction.inputs import check_grids, empty_volume
+from tslam_bench.reconstruction.torch_threads import torch_threads
 from tslam_bench.reconstruction.volume import Volume
 
 CHECKPOINT_FORMAT: Final = "tslam-bench reconstruction network, version 1"
 NETWORKS: Final[dict[str, dict[str, Any]]] = {
     "ifnet": {"small": ifnet.SMALL, "paper": ifnet.PAPER},
     "convonet": {"small": convonet.SMALL},
+    "unet": {"small": unet.SMALL},
 }
 """Architectures and their named sizes."""
 _CLASSES: Final[dict[str, tuple[type, type]]] = {
     "ifnet": (ifnet.IFNet, ifnet.IFNetConfig),
     "convonet": (convonet.ConvONet, convonet.ConvONetConfig),
+    "unet": (unet.UNet, unet.UNetConfig),
 }
 _REMEDY: Final = "train it again with `tslam-bench reconstruct train`"
 
@@ -50,19 +53,6 @@ def build_network(architecture: str, config: Any, seed: int = 0) -> torch.nn.Mod
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return _CLASSES[architecture][0](config)
-
-
-@contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Runs a block with ``count`` torch threads and restores the number afterwards."""
-    if count < 1:
-        raise InvalidInputError(f"threads {count}: choose at least 1")
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _plain(value: Any) -> Any:
@@ -232,7 +222,9 @@ def _twice(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cells.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
 
 
-def load_reconstructor(model: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
+def load_reconstructor(
+    model: Path, name: str | None = None, threads: int = 1
+) -> LearnedReconstructor | DenseReconstructor:
     """The reconstructor of a checkpoint.
 
     Raises:
@@ -243,4 +235,6 @@ def load_reconstructor(model: Path, name: str | None = None, threads: int = 1) -
         raise InvalidInputError(
             f"{model}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor"
         )
+    if architecture == "unet":
+        return DenseReconstructor(architecture, [network], [training], threads=threads)
     return LearnedReconstructor(architecture, network, training, threshold, threads=threads)

@@ -72,6 +72,13 @@ _RECONSTRUCTORS: Final = Registry(
             name="convonet",
         ),
         _built_in(
+            "unet",
+            "model",
+            "tslam_bench.reconstruction.learned:load_reconstructor",
+            "U-Net on folded grids: output of twice the grid's resolution, surface at the best expected IoU",
+            name="unet",
+        ),
+        _built_in(
             "mean_shape",
             "objects",
             "tslam_bench.reconstruction.priors:load_mean_shape",

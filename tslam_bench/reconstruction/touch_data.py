@@ -170,9 +170,7 @@ class TouchObject:
         edge = WORKSPACE_EDGE / FINE_SIZE
         origin = np.full(3, WORKSPACE_LOW + edge / 2)
         fine = inside_grid(TriangleMesh(item.vertices, item.faces), origin, edge, (FINE_SIZE,) * 3)
-        return cls(
-            item.name, item.surface, item.solid, np.packbits(fine), _count(fine), tuple(explored), simulated
-        )
+        return cls(item.name, item.surface, item.solid, np.packbits(fine), _count(fine), tuple(explored), simulated)
 
     def scaled(self, scale: float) -> NDArray[np.uint8]:
         """Counts (64, 64, 64) of the solid scaled about the centre of W."""
@@ -208,9 +206,7 @@ def load_touch_data(
     data = []
     for done, item in enumerate(items):
         explored = [ExploredObject.load(folder / name, item.name) for name in policies if name != SIMULATED_FOLDER]
-        simulated = (
-            SimulatedObject.load(folder / SIMULATED_FOLDER, item.name) if SIMULATED_FOLDER in policies else None
-        )
+        simulated = SimulatedObject.load(folder / SIMULATED_FOLDER, item.name) if SIMULATED_FOLDER in policies else None
         data.append(TouchObject.of(item, explored, simulated))
         if progress:
             progress(done + 1, len(items))

@@ -24,6 +24,9 @@ CELLS: Final = GRID_SIZE // FOLD
 INPUT_CHANNELS: Final = 2 * FOLD**3 + 3
 """Touched and visited of each of a cell's voxels, and the cell's place."""
 
+_EMPTY_LOGIT: Final = -3.0
+"""Where the untrained output begins: most of W is empty."""
+
 
 @dataclass(frozen=True)
 class UNetConfig:
@@ -73,6 +76,9 @@ class UNet(nn.Module):
         self.down = nn.ModuleList([_Block(a, b) for a, b in zip((widths[0], *widths), widths, strict=False)])
         self.up = nn.ModuleList([_Block(a + b, b) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)])
         self.leave = nn.Sequential(nn.GroupNorm(8, widths[0]), nn.SiLU(), nn.Conv3d(widths[0], self.parts**3, 1))
+        last = self.leave[-1]
+        assert isinstance(last, nn.Conv3d) and last.bias is not None
+        nn.init.constant_(last.bias, _EMPTY_LOGIT)
         axis = (torch.arange(CELLS) + 0.5) * (2 / CELLS) - 1
         self.register_buffer(
             "place", torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"))[None], persistent=False

@@ -16,9 +16,9 @@ from tslam_bench.errors import InvalidInputError
 from tslam_bench.grids import turn, voxel_centres
 from tslam_bench.objects.store import PreparedObject
 from tslam_bench.reconstruction import unet
-from tslam_bench.reconstruction.dense import SYMMETRIES, DenseReconstructor, volume_at_best_level
-from tslam_bench.reconstruction.learned import NETWORKS, build_network, load_reconstructor
-from tslam_bench.reconstruction.levels import level_of_best_iou
+from tslam_bench.reconstruction.dense import SYMMETRIES, DenseReconstructor
+from tslam_bench.reconstruction.learned import NETWORKS, build_network
+from tslam_bench.reconstruction.levels import level_of_best_iou, volume_at_level
 from tslam_bench.reconstruction.registry import make_reconstructor
 from tslam_bench.reconstruction.touch_data import (
     COUNTS_SIZE,
@@ -33,8 +33,10 @@ from tslam_bench.reconstruction.touch_data import (
     random_symmetry,
     simulate_object,
 )
+from tslam_bench.reconstruction.trained import load_reconstructor
 from tslam_bench.reconstruction.training import draw_batch, train
 from tslam_bench.reconstruction.training_config import TrainingConfig
+from tslam_bench.reconstruction.weights import save_weights
 from tslam_bench.scoring.metrics import calibration_error, iou
 
 torch.set_num_threads(1)
@@ -240,7 +242,7 @@ def test_networks_are_averaged_and_their_disagreement_is_the_variance(angle: Pre
 def test_surface_is_where_the_expected_iou_is_best() -> None:
     generator = np.random.default_rng(8)
     probability = generator.random((16, 16, 16)) ** 4
-    volume = volume_at_best_level(probability)
+    volume = volume_at_level(probability)
     level = level_of_best_iou(probability)
     assert np.array_equal(volume.probability >= 0.5, probability >= level - 1e-7) and level < 0.45
     assert DenseReconstructor("unet", [Answers()]).reconstruct(EMPTY, ~EMPTY).probability.max() == 0
@@ -301,6 +303,37 @@ def test_network_learns_one_shape(precision: str, data: TouchObject, tmp_path: P
         belief = made.believe(turn(felt[0], symmetry), turn(felt[1], symmetry))
         weights = np.ones(true.size)
         assert calibration_error(belief.probability.reshape(-1), true.reshape(-1), weights) < 0.05
+
+
+def test_exported_weights_are_the_same_network_in_half_precision(
+    smallest_unet: None, data: TouchObject, tmp_path: Path
+) -> None:
+    paths = [tmp_path / f"{seed}.pt" for seed in range(2)]
+    for seed, path in enumerate(paths):
+        train([data], dataclasses.replace(TINY, steps=2, seed=seed), path)
+    exported = tmp_path / "both.safetensors"
+    save_weights(exported, paths, {"views": 2, "temperature": 1.5})
+    made = load_reconstructor(exported, "unet")
+    assert isinstance(made, DenseReconstructor) and (made.views, made.temperature) == (2, 1.5)
+    assert [record["seed"] for record in made.training] == [0, 1]
+    whole = [load_reconstructor(path) for path in paths]
+    for original, network in zip(whole, made.networks, strict=True):
+        assert isinstance(original, DenseReconstructor)
+        for a, b in zip(original.networks[0].parameters(), network.parameters(), strict=True):
+            assert torch.equal(a.half().float(), b)
+    networks = [model.networks[0] for model in whole if isinstance(model, DenseReconstructor)]
+    expected = DenseReconstructor("unet", networks, views=2, temperature=1.5).believe(data.surface, ~data.solid)
+    assert np.allclose(made.believe(data.surface, ~data.solid).probability, expected.probability, atol=2e-3)
+
+    with pytest.raises(InvalidInputError, match="not 'ifnet'"):
+        load_reconstructor(exported, "ifnet")
+    content = exported.read_bytes()
+    for damaged in (content[:100], content[:-100], b"", content.replace(b"version 1", b"version 9")):
+        exported.write_bytes(damaged)
+        with pytest.raises(InvalidInputError, match=r"both\.safetensors: damaged, or no weights"):
+            load_reconstructor(exported)
+    with pytest.raises(InvalidInputError, match="of 0 architectures"):
+        save_weights(exported, [], {})
 
 
 def test_bad_sizes_are_refused() -> None:

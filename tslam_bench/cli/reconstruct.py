@@ -88,6 +88,20 @@ class Collect:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write trained networks in half precision, with the record of their training, into one file that can be shipped."""
+
+    models: tuple[Path, ...]
+    """Checkpoints of one architecture; several unet are averaged."""
+    output: Path
+    """File to write, ending in .safetensors."""
+    views: int = 4
+    """unet: turned and mirrored copies of the grids that each network sees, 1 to 8."""
+    temperature: float = 1.0
+    """unet: what the logits are divided by, fixed on held-out objects."""
+
+
+@dataclass(frozen=True)
 class Run:
     """Reconstruct a shape from touched and visited grids, and write it as a mesh or a probability grid."""
 
@@ -113,7 +127,8 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
         BenchmarkError: bad input; the message is one line.
     """
-    commands = {"list": (List, _list), "collect": (Collect, _collect), "train": (Train, _train), "run": (Run, _run)}
+    commands = {"list": (List, _list), "collect": (Collect, _collect), "train": (Train, _train)}
+    commands |= {"export": (Export, _export), "run": (Run, _run)}
     about = "From touched and visited grids to a shape."
     run_command("tslam-bench reconstruct", about, commands, arguments)
 
@@ -224,6 +239,20 @@ def _train_on_data(parsed: Train, names: Sequence[str]) -> None:
         train(data, config, parsed.output, parsed.log, None, show)
         bar.show(config.steps)
     print(f"{parsed.output}: {config.architecture}, {config.steps} steps on {len(data)} objects")
+
+
+def _export(parsed: Export) -> None:
+    from tslam_bench.reconstruction.trained import load_reconstructor
+    from tslam_bench.reconstruction.weights import SUFFIX, save_weights
+
+    if parsed.output.suffix != SUFFIX:
+        raise InvalidInputError(f"--output {parsed.output}: end it in {SUFFIX}")
+    check_output(parsed.output, parsed.models)
+    dense = load_reconstructor(parsed.models[0]).name == "unet" if parsed.models else False
+    settings = {"views": parsed.views, "temperature": parsed.temperature} if dense else {}
+    save_weights(parsed.output, parsed.models, settings)
+    made = load_reconstructor(parsed.output)
+    print(f"{parsed.output}: {made.name}, {len(parsed.models)} networks, {parsed.output.stat().st_size / 1e6:.1f} MB")
 
 
 def _run(parsed: Run) -> None:

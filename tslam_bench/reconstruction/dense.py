@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.grids import turn
 from tslam_bench.reconstruction.inputs import check_grids, empty_volume
-from tslam_bench.reconstruction.levels import level_of_best_iou
+from tslam_bench.reconstruction.levels import volume_at_level
 from tslam_bench.reconstruction.torch_threads import torch_threads
 from tslam_bench.reconstruction.volume import Volume
 
@@ -31,7 +31,7 @@ SYMMETRIES: Final[tuple[NDArray[np.int64], ...]] = tuple(
     )
 )
 """Signed permutations in which a network sees the grids; all 48 mean the same to it, since it learned from all of them."""
-_SMALLEST, _LARGEST = 1e-4, 1 - 1e-4
+_SMALLEST: Final = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Belief:
     @property
     def entropy(self) -> NDArray[np.float32]:
         """(R, R, R) float32, entropy of each cell's occupancy (nats): everything that a touch could settle."""
-        p = np.clip(self.probability, _SMALLEST, _LARGEST)
+        p = np.clip(self.probability, _SMALLEST, 1 - _SMALLEST)
         return np.asarray(-(p * np.log(p) + (1 - p) * np.log(1 - p)), dtype=np.float32)
 
 
@@ -112,12 +112,4 @@ class DenseReconstructor:
         touched, visited = check_grids(touched, visited)
         if not touched.any():
             return empty_volume()
-        return volume_at_best_level(self.believe(touched, visited).probability)
-
-
-def volume_at_best_level(probability: NDArray[np.floating]) -> Volume:
-    """A volume whose 0.5 level is the level of the best expected IoU of ``probability`` (R, R, R)."""
-    level = level_of_best_iou(probability)
-    p = np.clip(probability, _SMALLEST, _LARGEST)
-    odds = p / (1 - p) * ((1 - level) / level)
-    return Volume((odds / (1 + odds)).astype(np.float32), "linear")
+        return volume_at_level(self.believe(touched, visited).probability)

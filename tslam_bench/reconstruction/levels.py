@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-LOWEST, HIGHEST = 0.1, 0.6
+from tslam_bench.reconstruction.volume import Volume
+
+LOWEST: Final = 0.1
+HIGHEST: Final = 0.6
+_SMALLEST: Final = 1e-4
 
 
 def level_of_best_iou(probability: NDArray[np.floating]) -> float:
@@ -29,3 +35,14 @@ def level_of_best_iou(probability: NDArray[np.floating]) -> float:
     if not allowed.any():
         return 0.5
     return float(values[allowed][int(expected[allowed].argmax())])
+
+
+def volume_at_level(probability: NDArray[np.floating], level: float | None = None) -> Volume:
+    """A volume whose 0.5 level is ``level`` of ``probability`` (R, R, R): the difference of their logits is taken off.
+
+    ``level`` None: :func:`level_of_best_iou`.
+    """
+    level = level_of_best_iou(probability) if level is None else level
+    p = np.clip(probability, _SMALLEST, 1 - _SMALLEST)
+    odds = p / (1 - p) * ((1 - level) / level)
+    return Volume((odds / (1 + odds)).astype(np.float32), "linear")

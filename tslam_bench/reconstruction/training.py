@@ -18,7 +18,7 @@ import torch.nn.functional as functional
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from tslam_bench.constants import GRID_SIZE, OCCUPANCY_THRESHOLD, WORKSPACE_EDGE, WORKSPACE_LOW
+from tslam_bench.constants import GRID_SIZE, WORKSPACE_EDGE, WORKSPACE_LOW
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import ensure_writable_directory
 from tslam_bench.grids import voxel_centres
@@ -26,7 +26,6 @@ from tslam_bench.reconstruction.dense import DenseReconstructor
 from tslam_bench.reconstruction.learned import (
     LearnedReconstructor,
     build_network,
-    load_reconstructor,
     network_config,
     read_checkpoint,
     save_checkpoint,
@@ -34,6 +33,7 @@ from tslam_bench.reconstruction.learned import (
 from tslam_bench.reconstruction.torch_threads import torch_threads
 from tslam_bench.reconstruction.touch_data import COUNTS_SIZE, ExampleMixture, TouchObject, draw_example
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
+from tslam_bench.reconstruction.trained import load_reconstructor
 from tslam_bench.reconstruction.training_config import TrainingConfig
 from tslam_bench.reconstruction.training_shapes import TrainingShape, place
 
@@ -214,7 +214,7 @@ def train(
     network.eval()
     for parameter, value in zip(network.parameters(), mean, strict=False):
         parameter.data.copy_(value)
-    threshold = OCCUPANCY_THRESHOLD
+    threshold = None
     if not isinstance(shapes[0], TouchObject):
         with torch_threads(config.threads):
             threshold = best_threshold(network, threshold_shapes or shapes, config)  # type: ignore[arg-type]

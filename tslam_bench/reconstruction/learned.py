@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,19 +18,23 @@ from tslam_bench.constants import GRID_SIZE, OCCUPANCY_THRESHOLD
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file
 from tslam_bench.grids import voxel_centres
-from tslam_bench.reconstruction import convonet, ifnet
+from tslam_bench.reconstruction import convonet, ifnet, unet
 from tslam_bench.reconstruction.inputs import check_grids, empty_volume
+from tslam_bench.reconstruction.levels import volume_at_level
+from tslam_bench.reconstruction.torch_threads import torch_threads
 from tslam_bench.reconstruction.volume import Volume
 
 CHECKPOINT_FORMAT: Final = "tslam-bench reconstruction network, version 1"
 NETWORKS: Final[dict[str, dict[str, Any]]] = {
     "ifnet": {"small": ifnet.SMALL, "paper": ifnet.PAPER},
     "convonet": {"small": convonet.SMALL},
+    "unet": {"small": unet.SMALL},
 }
 """Architectures and their named sizes."""
-_CLASSES: Final[dict[str, tuple[type, type]]] = {
+NETWORK_CLASSES: Final[dict[str, tuple[type, type]]] = {
     "ifnet": (ifnet.IFNet, ifnet.IFNetConfig),
     "convonet": (convonet.ConvONet, convonet.ConvONetConfig),
+    "unet": (unet.UNet, unet.UNetConfig),
 }
 _REMEDY: Final = "train it again with `tslam-bench reconstruct train`"
 
@@ -50,20 +53,7 @@ def build_network(architecture: str, config: Any, seed: int = 0) -> torch.nn.Mod
     """A freshly initialised network; the same seed gives the same weights and leaves torch's own generator alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return _CLASSES[architecture][0](config)
-
-
-@contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Runs a block with ``count`` torch threads and restores the number afterwards."""
-    if count < 1:
-        raise InvalidInputError(f"threads {count}: choose at least 1")
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+        return NETWORK_CLASSES[architecture][0](config)
 
 
 def _plain(value: Any) -> Any:
@@ -73,8 +63,9 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+def tuples(value: Any) -> Any:
+    """Lists as tuples, all the way down: what configurations hold."""
+    return tuple(tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def save_checkpoint(
@@ -82,7 +73,7 @@ def save_checkpoint(
     architecture: str,
     network: torch.nn.Module,
     training: dict[str, Any],
-    threshold: float = OCCUPANCY_THRESHOLD,
+    threshold: float | None = OCCUPANCY_THRESHOLD,
     extra: dict[str, Any] | None = None,
 ) -> None:
     """Writes architecture, configuration, weights and the training record to ``path``, atomically.
@@ -92,7 +83,7 @@ def save_checkpoint(
         architecture: name in :data:`NETWORKS`.
         network: the network.
         training: what it was trained on and for how long; numbers, strings, lists and dicts only.
-        threshold: probability at which the network's output counts as solid.
+        threshold: probability at which the network's output counts as solid; None: see :class:`LearnedReconstructor`.
         extra: further entries, such as the optimiser's state.
     """
     content = {
@@ -128,7 +119,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def load_network(path: Path) -> tuple[str, torch.nn.Module, float, dict[str, Any]]:
+def load_network(path: Path) -> tuple[str, torch.nn.Module, float | None, dict[str, Any]]:
     """Architecture name, network in evaluation mode, threshold and training record of a checkpoint.
 
     Raises:
@@ -137,12 +128,12 @@ def load_network(path: Path) -> tuple[str, torch.nn.Module, float, dict[str, Any
     content = read_checkpoint(path)
     try:
         architecture = content["architecture"]
-        config = _CLASSES[architecture][1](**{key: _tuples(value) for key, value in content["config"].items()})
+        config = NETWORK_CLASSES[architecture][1](**{key: tuples(value) for key, value in content["config"].items()})
         network = build_network(architecture, config)
         network.load_state_dict(content["weights"])
         training = dict(content["training"])
-        threshold = float(content["threshold"])
-        if not 0 < threshold < 1:
+        threshold = content["threshold"]
+        if threshold is not None and not 0 < float(threshold) < 1:
             raise ValueError("threshold")
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise InvalidInputError(f"{path}: weights and configuration do not fit together; {_REMEDY}") from error
@@ -166,7 +157,8 @@ class LearnedReconstructor:
         name: registered name.
         network: network with ``encode`` and ``decode``, in evaluation mode.
         training: its training record, for the reports.
-        threshold: probability at which the network's output counts as solid.
+        threshold: probability at which the network's output counts as solid; None: the level of the best expected IoU
+            (:mod:`tslam_bench.reconstruction.levels`) of each volume.
         resolutions: cells per axis of the lattices, each twice the one before; the last is the volume's. Default: the
             network's configuration.
         batch_points: query points per pass.
@@ -178,7 +170,7 @@ class LearnedReconstructor:
         name: str,
         network: torch.nn.Module,
         training: dict[str, Any] | None = None,
-        threshold: float = OCCUPANCY_THRESHOLD,
+        threshold: float | None = OCCUPANCY_THRESHOLD,
         resolutions: Sequence[int] | None = None,
         batch_points: int = 8192,
         threads: int = 1,
@@ -206,7 +198,7 @@ class LearnedReconstructor:
                 wanted = _twice(_level_in_reach(probability) | maximum_filter(_holds_touch(touched, size // 2), 3))
                 probability = zoom(probability, 2, order=1, mode="nearest", grid_mode=True)
                 probability[wanted] = self._query(features, voxel_centres(size)[wanted])
-        return Volume(np.clip(probability, 0, 1), "linear")
+        return volume_at_level(np.clip(probability, 0, 1), self.threshold)
 
     def _query(self, features: list[torch.Tensor], points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Probabilities (M,) at points (M, 3)."""
@@ -214,8 +206,7 @@ class LearnedReconstructor:
         logits = [self.network.decode(features, batch[None])[0] for batch in batches]  # type: ignore[operator]
         if not logits:
             return np.zeros(0, dtype=np.float32)
-        offset = float(np.log(self.threshold / (1 - self.threshold)))
-        return torch.sigmoid(torch.cat(logits) - offset).numpy()
+        return torch.sigmoid(torch.cat(logits)).numpy()
 
 
 def _level_in_reach(probability: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -233,17 +224,3 @@ def _holds_touch(touched: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
 def _twice(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Every cell as its 2^3 children."""
     return cells.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
-
-
-def load_reconstructor(model: Path, name: str | None = None, threads: int = 1) -> LearnedReconstructor:
-    """The reconstructor of a checkpoint.
-
-    Raises:
-        InvalidInputError: see :func:`load_network`; also a checkpoint of another architecture than ``name``.
-    """
-    architecture, network, threshold, training = load_network(model)
-    if name is not None and architecture != name:
-        raise InvalidInputError(
-            f"{model}: holds a network of {architecture!r}, not {name!r}; choose that reconstructor"
-        )
-    return LearnedReconstructor(architecture, network, training, threshold, threads=threads)

@@ -60,16 +60,23 @@ _RECONSTRUCTORS: Final = Registry(
         _built_in(
             "ifnet",
             "model",
-            "tslam_bench.reconstruction.learned:load_reconstructor",
+            "tslam_bench.reconstruction.trained:load_reconstructor",
             "IF-Net: implicit function in multi-scale features, with free space",
             name="ifnet",
         ),
         _built_in(
             "convonet",
             "model",
-            "tslam_bench.reconstruction.learned:load_reconstructor",
+            "tslam_bench.reconstruction.trained:load_reconstructor",
             "convolutional occupancy network: a U-Net's features, with free space",
             name="convonet",
+        ),
+        _built_in(
+            "unet",
+            "model",
+            "tslam_bench.reconstruction.trained:load_reconstructor",
+            "U-Net on folded grids: output of twice the grid's resolution, surface at the best expected IoU",
+            name="unet",
         ),
         _built_in(
             "mean_shape",
@@ -131,7 +138,7 @@ def make_reconstructor(
 
     Args:
         reconstructor: see :func:`get_reconstructor`.
-        model: checkpoint, for those that need a model; the user's own get the path.
+        model: checkpoint or weights, for those that need a model; None: the shipped weights. The user's own get the path.
         split: split whose prepared objects ``mean_shape`` and ``retrieval`` are built from.
         cache: asset cache, default the user's.
         threads: torch threads of the benchmark's learned ones.
@@ -144,6 +151,8 @@ def make_reconstructor(
         UserCodeError: the user's code raised something.
     """
     spec = get_reconstructor(reconstructor)
+    if spec.needs == "model" and model is None:
+        model = shipped_weights(spec.id)
     if spec.needs == "model" and model is None:
         raise InvalidInputError(
             f"reconstructor {spec.id!r}: needs a model; train one with "
@@ -161,8 +170,16 @@ def make_reconstructor(
 def reconstructor_source(reconstructor: Any, model: Path | None, objects: Sequence[str] = ()) -> dict[str, Any]:
     """What a reconstructor's results depend on: see :meth:`tslam_bench.plugins.Registry.source`."""
     spec = get_reconstructor(reconstructor)
+    if spec.needs == "model" and model is None:
+        model = shipped_weights(spec.id)
     arguments = {"objects": list(objects)} if spec.needs == "objects" else {}
     return _RECONSTRUCTORS.source(spec, arguments, model)
+
+
+def shipped_weights(identifier: str) -> Path | None:
+    """The file of weights that the package brings for a reconstructor, or None."""
+    path = Path(__file__).parent / "shipped" / f"{identifier}.safetensors"
+    return path if path.is_file() else None
 
 
 class _CheckedReconstructor:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE
+from tslam_bench.evaluation.weights import METADATA_FILE
 from tslam_bench.files import read_plain_file
 from tslam_bench.scoring.untrusted_json import parse_json
 

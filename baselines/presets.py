@@ -28,8 +28,11 @@ class RunSettings:
         training: further arguments of ``tslam-bench baselines train``.
         learning_objects: (split, names) of the objects to learn from; no names: the split's default set, whole. The
             reconstructors' thresholds are fixed on val, or on train while val is not listed.
-        reconstructors: ids; learned ones are trained first.
+        reconstructors: ids; learned ones whose weights are not shipped are trained first.
         reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
+        retrain: learned reconstructors are trained even if their weights are shipped.
+        collect: arguments of ``tslam-bench reconstruct collect``, whose touches the reconstructors learn from; none: they learn
+            from touches that are simulated as it goes.
         remark: shown beside the figures of learned baselines.
         policy_salt: where explorers' random numbers and the order of episodes come from. Ours do not look at it, so it is fixed:
             a run gives the same figures everywhere.
@@ -48,6 +51,8 @@ class RunSettings:
     remark: str
     policy_salt: str = "2021"
     shipped: bool = False
+    retrain: bool = False
+    collect: tuple[str, ...] = ()
 
 
 _QUICK_TRAINING: Final = (
@@ -87,6 +92,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         reconstructors=("grid", "hull", "carve", "ifnet"),
         reconstruction_training=("--steps", "3", "--batch-size", "2", "--threshold-examples", "4"),
         remark="shows that everything runs, nothing else",
+        retrain=True,
     ),
     "scripted": RunSettings(
         name="scripted",
@@ -127,6 +133,8 @@ PRESETS: Final[dict[str, RunSettings]] = {
         reconstructors=("grid", "hull", "carve", "ifnet"),
         reconstruction_training=("--steps", "20000", "--batch-size", "16", "--points", "2048"),
         remark="",
+        retrain=True,
+        collect=("--repetitions", "1"),
     ),
 }
 """``quick``: a leaderboard within 15 minutes on 2 cores. ``tiny``: the same path in a minute or two, for CI. ``scripted``: what

@@ -29,6 +29,7 @@ from tslam_bench.evaluation.weights import METADATA_FILE, shipped_seeds, shipped
 from tslam_bench.objects.splits import known_names
 from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.reconstruction.registry import get_reconstructor
+from tslam_bench.reconstruction.registry import shipped_weights as shipped_reconstructor
 from tslam_bench.scoring.submission import INFO_FILE
 
 from .presets import PRESETS, RunSettings
@@ -69,6 +70,8 @@ class Arguments:
     """Training steps of each learned baseline instead of the preset's."""
     reconstructors: tuple[str, ...] | None = None
     """Reconstructors instead of the preset's: ids (tslam-bench reconstruct list), module:Class or file.py:Class."""
+    retrain: bool = False
+    """Train the learned reconstructors even if their weights are shipped."""
     policy_salt: str | None = None
     """Hexadecimal digits that explorers' random numbers come from, instead of the preset's."""
     output: Path | None = None
@@ -109,6 +112,7 @@ def settings_of(arguments: Arguments) -> RunSettings:
             shipped_weights(baseline, known[0] if known else settings.seeds[0])
     for reconstructor in settings.reconstructors:
         get_reconstructor(reconstructor)
+    settings = replace(settings, retrain=settings.retrain or arguments.retrain)
     unique = {name: tuple(dict.fromkeys(getattr(settings, name))) for name in ("baselines", "reconstructors", "seeds")}
     return replace(settings, **unique)  # type: ignore[arg-type]
 
@@ -168,11 +172,11 @@ def _learning_assets(settings: RunSettings) -> tuple[str, ...]:
 
 
 def _models(settings: RunSettings, output: Path) -> dict[str, Path]:
-    """Learned reconstructor -> its checkpoint."""
+    """Learned reconstructor that is trained -> its checkpoint."""
     return {
         name: output / "models" / f"{name}.pt"
         for name in settings.reconstructors
-        if get_reconstructor(name).needs == "model"
+        if get_reconstructor(name).needs == "model" and (settings.retrain or shipped_reconstructor(name) is None)
     }
 
 
@@ -181,11 +185,19 @@ def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
     learning = dict(settings.learning_objects)
     held_out = "val" if "val" in learning else "train"
     threshold = ("--threshold-split", held_out, *_listed("--threshold-objects", learning[held_out]))
-    for name, model in _models(settings, output).items():
-        command: Command = ("tslam-bench", "reconstruct", "train", "--architecture", name)
-        command += (*_listed("--objects", learning["train"]), *threshold)
+    models, after = _models(settings, output), _learning_assets(settings)
+    data: Command = ()
+    if settings.collect and models:
+        touches = output / "touches"
+        command: Command = ("tslam-bench", "reconstruct", "collect", "--output", str(touches), *settings.collect)
+        command += _listed("--objects", learning["train"])
+        jobs.append(Job("collect-touches", command, (_TEST_ASSETS, "assets-train"), always=True))
+        after, data = ("collect-touches",), ("--data", str(touches))
+    for name, model in models.items():
+        command = ("tslam-bench", "reconstruct", "train", "--architecture", name, *data)
+        command += (*_listed("--objects", learning["train"]), *(() if data else threshold))
         command += (*settings.reconstruction_training, "--output", str(model))
-        jobs.append(Job(f"train-{name}", command, _learning_assets(settings), (model,)))
+        jobs.append(Job(f"train-{name}", command, after, (model,)))
     for name in settings.baselines:
         if get_baseline(name).kind == "learned" and settings.steps:
             folder = output / "models" / name

@@ -24,6 +24,7 @@ runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run i
   --steps N              training steps of each learned baseline
   --reconstructors ID ...
                          reconstructors instead of the preset's (tslam-bench reconstruct list), or the like
+  --retrain              train the learned reconstructors even if their weights are shipped
   --policy-salt DIGITS   hexadecimal digits that explorers' random numbers come from
   --output FOLDER        folder of the run (default: runs/ and the preset's name)
   --workers N            processes at a time (default: the cores)

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 from tslam_bench.errors import AssetError, InvalidInputError
 
 RENDER_MODES: Final = ("rgb_array", "human", "sensors", "all")
-NO_VULKAN: Final = "no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU (tslam-bench doctor tells how)"
+NO_VULKAN: Final = (
+    "no Vulkan device; install a GPU driver, or Mesa 25's lavapipe for rendering on the CPU "
+    "(tslam-bench doctor tells how)"
+)
 _TEXTURES: Final = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
 _PICTURES: Final = (*_TEXTURES, "rgbd", "sensor_data", "pointcloud")
 _STATES: Final = ("state_dict", "state", "none")

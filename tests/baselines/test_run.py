@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tslam_bench import cli
+from tslam_bench.baselines import run
 from tslam_bench.baselines.run import PRESETS, Arguments, plan, settings_of
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import InvalidInputError
@@ -67,6 +68,29 @@ def test_quick_run_is_what_it_promises(tmp_path: Path) -> None:
             assert "32,000 steps, proves the path, not the method" in command
     assert tmp_path / "leaderboard.json" in jobs["leaderboard"].outputs
     assert tmp_path / "index.html" in jobs["leaderboard"].outputs
+
+
+def test_reconstructors_are_trained_where_no_weights_are_shipped_or_it_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trained(arguments: Arguments) -> set[str]:
+        jobs = plan(settings_of(arguments), tmp_path, 2)
+        evaluated = next(shlex.join(job.command) for job in jobs if job.name == "evaluate-heuristic")
+        names = {job.name for job in jobs if job.command[:3] == ("tslam-bench", "reconstruct", "train")}
+        assert ("ifnet=" in evaluated) == ("train-ifnet" in names)  # a model is named where one is trained
+        return names
+
+    monkeypatch.setattr(run, "shipped_reconstructor", lambda name: None)
+    assert trained(Arguments(quick=True)) >= {"train-ifnet"}
+    monkeypatch.setattr(run, "shipped_reconstructor", lambda name: Path("weights"))
+    assert trained(Arguments(quick=True)) == set()
+    assert trained(Arguments(quick=True, retrain=True)) >= {"train-ifnet"}
+    assert trained(Arguments(full=True)) >= {"train-ifnet"}
+    (collect,) = (job for job in plan(PRESETS["full"], tmp_path, 2) if job.name == "collect-touches")
+    full = {job.name: job for job in plan(PRESETS["full"], tmp_path, 2)}
+    assert full["train-ifnet"].after == ("collect-touches",)
+    folder = collect.command[collect.command.index("--output") + 1]
+    assert full["train-ifnet"].command[full["train-ifnet"].command.index("--data") + 1] == folder
 
 
 def test_what_is_learned_from_is_named(tmp_path: Path) -> None:

@@ -46,4 +46,5 @@ if [ $# -eq 0 ]; then  # a chosen test needs no run of the whole chain
     step bash baselines/run_all.sh --tiny --output "$tiny"
     test -s "$tiny/index.html"
 fi
-step "$PYTHON" -m pytest "${markers[@]}" "$@"
+# One process per core; a file stays with one process, since its tests share what they prepare.
+step "$PYTHON" -m pytest -n auto --dist loadfile "${markers[@]}" "$@"

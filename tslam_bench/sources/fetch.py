@@ -35,7 +35,8 @@ def _pip_reason(output: str) -> str:
     """The line of pip's output that says why it failed."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("ERROR")]
-    return (errors or lines or ["no output"])[-1].removeprefix("ERROR:").strip()
+    reason = (errors or lines or ["no output"])[-1].removeprefix("ERROR:").strip()
+    return lines[-1] if reason == "Exception:" else reason  # a traceback follows: a full disk, say
 
 
 def fetch_wheel(name: str, version: str, sha256: str, cache: Path | None = None) -> Path:

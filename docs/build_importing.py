@@ -101,11 +101,6 @@ def rows() -> list[tuple[str, str]]:
                 "ball": "after repair by a rolling ball",
                 "closed": "after its openings were closed",
             }
-                "kept": "as it is",
-                "winding": "after repair",
-                "ball": "after repair by a rolling ball",
-                "closed": "after its openings were closed",
-            }
             found.append((text, f"accepted {method[reason]}" if status == "accepted" else f"`{reason}`"))
     return found
 

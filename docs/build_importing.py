@@ -95,7 +95,12 @@ def rows() -> list[tuple[str, str]]:
         for number, (text, item) in enumerate(items):
             (source,) = fuzz_importer.write_mutants([item], Path(folder) / str(number))
             status, reason = fuzz_importer.cheap_import(source, Path(folder))
-            method = {"kept": "as it is", "winding": "after repair", "ball": "after repair by a rolling ball"}
+            method = {
+                "kept": "as it is",
+                "winding": "after repair",
+                "ball": "after repair by a rolling ball",
+                "closed": "after its openings were closed",
+            }
             found.append((text, f"accepted {method[reason]}" if status == "accepted" else f"`{reason}`"))
     return found
 

@@ -67,7 +67,7 @@ def objects_table(manifests: Manifests) -> str:
             r["category"],
             " x ".join(f"{100 * x:.1f}" for x in r["extents_m"]),
             f"{1e6 * r['volume_m3']:.0f}",
-            {"kept": "", "winding": "rebuilt", "ball": "ball"}[r["repair"]]
+            {"kept": "", "winding": "rebuilt", "ball": "ball", "closed": "closed"}[r["repair"]]
             + (" filled" if r["differs_from_raw"] else ""),
             r["gates"]["genus"],
             r["hull_count"],

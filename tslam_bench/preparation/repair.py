@@ -2,6 +2,9 @@
 
 The ladder: a mesh that manifold3d accepts is kept as it is; one whose winding numbers are unambiguous is rebuilt from its
 exact distance with the winding sign; anything else is rebuilt by rolling a ball around it.
+
+Both ways of rebuilding can lose the inside of a closed body through an opening: inside and outside become one, and a shell comes
+out. Where much less is left than the surface encloses with its openings closed, they are closed (``openings``), or it is refused.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from tslam_bench.errors import AssetError
 from tslam_bench.geometry.distance import distance_to_mesh, winding_numbers
 from tslam_bench.geometry.meshes import TriangleMesh, from_manifold, is_valid, simplify, to_manifold, union
 from tslam_bench.geometry.sampling import sample_surface
+from tslam_bench.preparation import openings
 
 MAX_TRIANGLES = 8_000
 """Triangles of a ground-truth mesh."""
@@ -34,11 +38,16 @@ BALL_SHARE = 0.02
 """Radius of that ball as a share of the longest edge."""
 BALL_OFFSET = 0.9
 """Outward offset of the rolled surface in sample spacings: less perforates sheets without thickness."""
+LOST_SHARE = 0.5
+"""The inside counts as lost when rebuilding leaves less than the rest of what the surface encloses with its openings closed. The
+walls that a ball leaves, two of 1.1 % of the longest edge, are themselves half of a body that is only 5 % thick."""
+MENDED_ERROR = 0.1
+"""Largest relative difference between that volume and the one of the mended solid."""
 CRUMB_VOLUME = 1e-9
 """Closed surfaces around less than this volume (m^3; a cubic millimetre) are dropped."""
 _SEED = 20211108
 
-Method = Literal["kept", "winding", "ball"]
+Method = Literal["kept", "winding", "ball", "closed"]
 
 
 @dataclass(frozen=True)
@@ -69,9 +78,10 @@ def repair(mesh: TriangleMesh) -> Repaired:
     if is_valid(solid) and solid.volume() < 0:
         solid = to_manifold(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1]), merge=True)
     if not is_valid(solid):
-        method = "winding" if winding_is_unambiguous(mesh) else "ball"
-        rebuilt = remesh_by_winding(mesh) if method == "winding" else remesh_by_ball(mesh)
-        solid = to_manifold(rebuilt)
+        solid, method = _rebuilt(mesh)
+        closed = without_lost_inside(mesh, solid)
+        if closed is not None:
+            solid, method = closed, "closed"
     if not is_valid(solid) or solid.volume() <= 0:
         status = solid.status()
         reason = "it encloses no volume" if status == manifold3d.Error.NoError else status.name
@@ -81,6 +91,43 @@ def repair(mesh: TriangleMesh) -> Repaired:
     if not is_valid(simplified):
         raise AssetError("flat: nothing is left of the mesh when it is simplified")
     return Repaired(simplified, method, kept_share)
+
+
+def _rebuilt(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, Method]:
+    if winding_is_unambiguous(mesh):
+        return to_manifold(remesh_by_winding(mesh)), "winding"
+    return to_manifold(remesh_by_ball(mesh)), "ball"
+
+
+def without_lost_inside(mesh: TriangleMesh, solid: manifold3d.Manifold) -> manifold3d.Manifold | None:
+    """The solid of the mesh with its damage closed, if ``solid`` lost the inside; None if it did not.
+
+    Args:
+        mesh: the mesh (m).
+        solid: what was rebuilt from it.
+
+    Raises:
+        AssetError: the inside is lost through an opening of which nobody can say whether it is damage.
+    """
+    found = [o for o in openings.find_openings(mesh) if o.kind(mesh.extents) != "mouth"]
+    if not found:
+        return None
+    volume = solid.volume() if is_valid(solid) else 0.0
+    enclosed = _enclosed_volume(openings.close(mesh, found))
+    if enclosed is None or volume >= (1 - LOST_SHARE) * enclosed:
+        return None
+    closed = openings.close(mesh, [o for o in found if o.kind(mesh.extents) == "damage"])
+    mended = to_manifold(closed, merge=True)
+    if not is_valid(mended):
+        mended, _ = _rebuilt(closed)
+    kept = mended.volume() if is_valid(mended) else 0.0
+    if abs(kept - enclosed) <= MENDED_ERROR * enclosed:
+        return mended
+    widest = max(o.width for o in found)
+    raise AssetError(
+        f"repair would lose the inside through an opening of {1e3 * widest:.0f} mm ({1e6 * max(volume, kept):.0f} of "
+        f"{1e6 * enclosed:.0f} cm3 would be left); close it, or give the wall a thickness"
+    )
 
 
 def _without_crumbs(solid: manifold3d.Manifold) -> manifold3d.Manifold:
@@ -113,11 +160,21 @@ def largest_part(solid: manifold3d.Manifold) -> tuple[manifold3d.Manifold, float
 
 def winding_is_unambiguous(mesh: TriangleMesh, count: int = 20_000) -> bool:
     """Whether winding numbers are integers, zero or one, nearly everywhere in the bounding box."""
+    return _inside_share(mesh, count) > 0
+
+
+def _inside_share(mesh: TriangleMesh, count: int = 20_000) -> float:
+    """Share of the bounding box that winding numbers call inside; 0 where they are ambiguous."""
     low, high = mesh.bounds
     points = np.random.default_rng(_SEED).uniform(low, high, (count, 3))
     winding = winding_numbers(points, mesh)
     ambiguous = (np.abs(winding - np.round(winding)) > 0.1) | (winding < -0.5)
-    return bool(ambiguous.mean() <= AMBIGUOUS_SHARE and (winding > 0.5).any())
+    return float((winding > 0.5).mean()) if ambiguous.mean() <= AMBIGUOUS_SHARE else 0.0
+
+
+def _enclosed_volume(mesh: TriangleMesh) -> float | None:
+    """Volume (m^3) inside the mesh by winding numbers, to a few percent; None where they are ambiguous."""
+    return float(np.prod(mesh.extents)) * _inside_share(mesh) or None
 
 
 def grid_around(mesh: TriangleMesh, spacing: float, padding: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:

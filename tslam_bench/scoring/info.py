@@ -106,7 +106,7 @@ class SubmissionInfo:
             ("environment_id", ENVIRONMENT_ID, "only the default task is scored"),
         ):
             if getattr(self, name) != own:
-                raise InvalidInputError(f"{name} is {getattr(self, name)!r}, the scorer's is {own!r}; {remedy}")
+                raise InvalidInputError(f"{name} is {_shown(getattr(self, name))}, the scorer's is {own!r}; {remedy}")
         for name in ("method", "package_version"):
             if not _text(getattr(self, name), name).strip():
                 raise InvalidInputError(f"{name} is empty; fill it in")
@@ -114,9 +114,11 @@ class SubmissionInfo:
             _text(getattr(self, name), name)
         for name in ("explorer", "reconstructor"):
             if not IDENTIFIER.fullmatch(_text(getattr(self, name), name)):
-                raise InvalidInputError(f"{name} {getattr(self, name)!r}: use at most 64 of a-z, 0-9, '_', '.', '-'")
+                raise InvalidInputError(
+                    f"{name} {_shown(getattr(self, name))}: use at most 64 of a-z, 0-9, '_', '.', '-'"
+                )
         if self.link and not re.fullmatch(r"https?://\S+", self.link):
-            raise InvalidInputError(f"link {self.link!r}: give an http(s) address or leave it empty")
+            raise InvalidInputError(f"link {_shown(self.link)}: give an http(s) address or leave it empty")
         if not _SHA256.fullmatch(_text(self.asset_manifest_sha256, "asset_manifest_sha256")):
             raise InvalidInputError("asset_manifest_sha256: expected 64 hexadecimal digits in lower case")
         if not isinstance(self.authors, tuple) or not 1 <= len(self.authors) <= 100:
@@ -131,15 +133,17 @@ class SubmissionInfo:
         if len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError("seeds: the same seed is listed twice")
         if self.object_set not in OBJECT_SETS:
-            raise InvalidInputError(f"object_set {self.object_set!r}: choose one of {', '.join(OBJECT_SETS)}")
+            raise InvalidInputError(f"object_set {_shown(self.object_set)}: choose one of {', '.join(OBJECT_SETS)}")
         if not isinstance(self.privileged, bool):
             raise InvalidInputError(f"privileged is {self.privileged!r}; expected true or false")
         if self.reward_mode is not None and self.reward_mode not in REWARD_MODES:
             raise InvalidInputError(
-                f"reward_mode {self.reward_mode!r}: choose null or one of {', '.join(REWARD_MODES)}"
+                f"reward_mode {_shown(self.reward_mode)}: choose null or one of {', '.join(REWARD_MODES)}"
             )
         if self.control_mode not in CONTROL_MODES:
-            raise InvalidInputError(f"control_mode {self.control_mode!r}: choose one of {', '.join(CONTROL_MODES)}")
+            raise InvalidInputError(
+                f"control_mode {_shown(self.control_mode)}: choose one of {', '.join(CONTROL_MODES)}"
+            )
         if self.policy_salt is not None and not _SALT.fullmatch(_text(self.policy_salt, "policy_salt")):
             raise InvalidInputError("policy_salt: expected 1 to 64 hexadecimal digits, or null")
         if not isinstance(self.training, Training):
@@ -156,7 +160,7 @@ class SubmissionInfo:
         ):
             used = f"explorer {self.explorer!r}"
             if self.reward_mode in PRIVILEGED_REWARD_MODES:
-                used = f"reward mode {self.reward_mode!r}"
+                used = f"reward mode {_shown(self.reward_mode)}"
             raise InvalidInputError(f"privileged is false, but {used} counts as privileged; set privileged to true")
 
     def to_json(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""Writes docs/leaderboard/, docs/results.md and the README's table from the score files in leaderboard/results/.
+"""Writes docs/leaderboard/, docs/results.md and the README's table from leaderboard/results/ and baselines/weights/.
 
 bash baselines/run_all.sh --full                           # the run itself
-python docs/build_results.py --run runs/full               # keep its score files, training curves and pictures; write the pages
+python docs/build_results.py --run runs/full               # keep its score files and pictures; write the pages
 python docs/build_results.py [--check]                     # write (or compare) the pages from what is kept
 
 A kept score file is a score file with figures of six significant digits. The tables are those of the test set; until score
@@ -11,7 +11,6 @@ files of it are kept, they come from leaderboard/results/scripted.json, a summar
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,13 +21,12 @@ from sections import filled, write_or_check
 
 from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.evaluation.policies import METADATA_FILE
 from tslam_bench.files import atomic_file
 from tslam_bench.leaderboard.commands import find_inputs, page_texts, plan_pictures
 from tslam_bench.leaderboard.pictures import make_pictures
 from tslam_bench.leaderboard.ranking import rank
 from tslam_bench.leaderboard.shown import PICTURES, Key, read_pictures, write_pictures
-from tslam_bench.leaderboard.training import CURVE_FILE, find_records, read_records
+from tslam_bench.leaderboard.training import find_records, read_records
 from tslam_bench.scoring.figures import (
     EXPLORATION_AREA,
     FIGURES,
@@ -47,6 +45,8 @@ from tslam_bench.scoring.untrusted_scores import parse_score, read_score
 ROOT: Final = Path(__file__).parent.parent
 RESULTS: Final = ROOT / "leaderboard" / "results"
 SUMMARY: Final = RESULTS / "scripted.json"
+WEIGHTS: Final = ROOT / "baselines" / "weights"
+"""Shipped weights; their records hold training curves."""
 SITE: Final = ROOT / "docs" / "leaderboard"
 PAGE: Final = ROOT / "docs" / "results.md"
 README: Final = ROOT / "README.md"
@@ -80,11 +80,11 @@ def kept_scores() -> list[SubmissionScore]:
 
 def kept_board() -> dict[str, Any]:
     """The ranking of what is kept."""
-    return rank(kept_scores(), read_records(find_records([RESULTS / "training"])))
+    return rank(kept_scores(), read_records(find_records([WEIGHTS])))
 
 
 def keep(config: Config, run: Path) -> None:
-    """Copies a run's score files, training curves and pictures to where the pages are built from.
+    """Copies a run's score files and pictures to where the pages are built from.
 
     Raises:
         InvalidInputError: it holds no score files, or one that was not made here.
@@ -101,12 +101,6 @@ def keep(config: Config, run: Path) -> None:
             temporary.write_text(text, encoding="utf-8")
         if score.info.object_set == "test":
             SUMMARY.unlink(missing_ok=True)
-    for folder in find_records([run]):
-        target = RESULTS / "training" / folder.name
-        target.mkdir(parents=True, exist_ok=True)
-        for name in (METADATA_FILE, CURVE_FILE):
-            shutil.copyfile(folder / name, target / name)
-
     board = kept_board()
     submissions = {submission.content_hash: submission for submission in map(read_submission, submission_paths)}
     planned = plan_pictures(board, submissions, config.pictured)

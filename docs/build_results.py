@@ -1,33 +1,58 @@
-"""Writes docs/results.md, and the README's table, from the results that are kept in leaderboard/results/.
+"""Writes docs/leaderboard/, docs/results.md and the README's table from leaderboard/results/ and baselines/weights/.
 
-bash baselines/run_all.sh --scripted                       # the run itself
-python docs/build_results.py --run runs/scripted           # keep its figures, write the pages
+bash baselines/run_all.sh --full                           # the run itself
+python docs/build_results.py --run runs/full               # keep its score files and pictures; write the pages
 python docs/build_results.py [--check]                     # write (or compare) the pages from what is kept
+
+A kept score file is a score file with figures of six significant digits. The tables are those of the test set; until score
+files of it are kept, they come from leaderboard/results/scripted.json, a summary of an earlier run.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import tyro
 from sections import filled, write_or_check
 
 from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.errors import InvalidInputError
-from tslam_bench.files import write_json
-from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, MISSING, Figure, interval, means, number
-from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
+from tslam_bench.files import atomic_file
+from tslam_bench.leaderboard.commands import find_inputs, page_texts, plan_pictures
+from tslam_bench.leaderboard.pictures import make_pictures
+from tslam_bench.leaderboard.ranking import rank
+from tslam_bench.leaderboard.shown import PICTURES, Key, read_pictures, write_pictures
+from tslam_bench.leaderboard.training import find_records, read_records
+from tslam_bench.scoring.figures import (
+    EXPLORATION_AREA,
+    FIGURES,
+    IOU_AREA,
+    MISSING,
+    Figure,
+    interval,
+    means,
+    number,
+    rounded,
+)
+from tslam_bench.scoring.score_file import SubmissionScore
+from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, read_submission
+from tslam_bench.scoring.untrusted_scores import parse_score, read_score
 
 ROOT: Final = Path(__file__).parent.parent
-KEPT: Final = ROOT / "leaderboard" / "results" / "scripted.json"
+RESULTS: Final = ROOT / "leaderboard" / "results"
+SUMMARY: Final = RESULTS / "scripted.json"
+WEIGHTS: Final = ROOT / "baselines" / "weights"
+"""Shipped weights; their records hold training curves."""
+SITE: Final = ROOT / "docs" / "leaderboard"
 PAGE: Final = ROOT / "docs" / "results.md"
 README: Final = ROOT / "README.md"
 README_RECONSTRUCTORS: Final = ("ifnet", "carve")
+DIGITS: Final = 6
+"""Significant digits of a kept figure."""
 COUNTS: Final = tuple(str(count) for count in RECONSTRUCTED_POSES)
 COLUMNS: Final = tuple(
     figure for figure in FIGURES if figure.metric in ("iou", "calibration_error", "chamfer_l2", "normal_consistency")
@@ -39,68 +64,94 @@ class Config:
     """Writes the pages of results."""
 
     run: Path | None = None
-    """Folder of a finished run whose figures are to be kept."""
+    """Folder of a finished run that is to be kept; entries of the same name and set of objects are replaced."""
+    pictured: int = 12
+    """Objects of the run in the page's gallery."""
+    workers: int = 1
+    """Processes that draw them."""
     check: bool = False
     """Only compare; exit with status 1 if a page is out of date."""
 
 
-def touched_voxels(run: Path) -> dict[str, float]:
-    """Mean touched voxels per pose of every explorer whose rollouts the run holds."""
-    from tslam_bench.scoring.rollout import Rollout
-
-    counts = {}
-    for folder in sorted((run / "rollouts").iterdir()):
-        files = sorted(folder.glob("*/pose*_seed*.npz"))
-        counts[folder.name] = float(np.mean([Rollout.load(path).touched.sum() for path in files]))
-    return counts
+def kept_scores() -> list[SubmissionScore]:
+    """The score files in leaderboard/results/, which whoever changes them here vouches for."""
+    return [read_score(path, vouched=True) for path in sorted((RESULTS / "scores").glob("*.json"))]
 
 
-def kept_figures(run: Path) -> dict[str, Any]:
-    """What is kept of a run: aggregates, ranks, touched voxels.
+def kept_board() -> dict[str, Any]:
+    """The ranking of what is kept."""
+    return rank(kept_scores(), read_records(find_records([WEIGHTS])))
+
+
+def keep(config: Config, run: Path) -> None:
+    """Copies a run's score files and pictures to where the pages are built from.
 
     Raises:
-        InvalidInputError: the run is not finished, or holds more than one table.
+        InvalidInputError: it holds no score files, or one that was not made here.
     """
-    path = run / "leaderboard.json"
-    if not path.is_file():
-        raise InvalidInputError(f"{path}: missing; let the run finish first")
-    board = json.loads(path.read_text(encoding="utf-8"))
-    if len(board["tables"]) != 1:
-        raise InvalidInputError(f"{path}: {len(board['tables'])} tables, expected one")
-    (table,) = board["tables"]
-    entries = []
-    for entry in table["entries"]:
-        info = entry["submission"]
-        entries.append(
-            {
-                "explorer": info["explorer"],
-                "reconstructor": info["reconstructor"],
-                "rank": entry["rank"],
-                "behind_leader": entry["behind_leader"],
-                "aggregate": entry["aggregate"],
-                "improvement": entry["improvement"],
-                "seeds": len(info["seeds"]),
-                "iou_area_per_object": {name: row["areas"]["iou_area"] for name, row in entry["per_object"].items()},
-            }
-        )
-    return {"objects": len(table["objects"]), "touched_voxels": touched_voxels(run), "entries": entries}
+    score_files, submission_paths = find_inputs([run])
+    if not score_files:
+        raise InvalidInputError(f"{run}: holds no score files; let the run finish first")
+    for path in score_files:
+        score = read_score(path)
+        if not score.made_here:
+            raise InvalidInputError(f"{path}: was not made on this machine; score its submission here")
+        text = json.dumps(_rounded(score).to_json(), sort_keys=True, allow_nan=False, separators=(",", ":")) + "\n"
+        with atomic_file(RESULTS / "scores" / f"{score.info.object_set}-{path.name}") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        if score.info.object_set == "test":
+            SUMMARY.unlink(missing_ok=True)
+    board = kept_board()
+    submissions = {submission.content_hash: submission for submission in map(read_submission, submission_paths)}
+    planned = plan_pictures(board, submissions, config.pictured)
+    drawn = make_pictures(list(dict.fromkeys(planned.values())), run / ".pictures", config.workers)
+    images = _pictures_of(board) | {key: drawn[picture] for key, picture in planned.items() if picture in drawn}
+    write_pictures(images, SITE / PICTURES)
 
 
-def exploration_table(kept: Mapping[str, Any]) -> str:
-    """Touched voxels and surface, a row per explorer."""
+def _pictures_of(board: Mapping[str, Any]) -> dict[Key, bytes]:
+    """The pictures that the page has, of entries and objects that are still there."""
+    objects = {("", name) for table in board["tables"] for name in table["objects"]}
+    objects |= {
+        (e["content_hash"], name) for table in board["tables"] for e in table["entries"] for name in table["objects"]
+    }
+    shown = read_pictures(SITE / PICTURES)
+    return {key: (SITE / picture.address).read_bytes() for key, picture in shown.items() if key[1:] in objects}
+
+
+def _rounded(score: SubmissionScore) -> SubmissionScore:
+    """The same score, its figures rounded, and what follows from others computed again from those."""
+    again = parse_score(rounded(score.to_json(), DIGITS), score.content_hash)
+    return replace(score, results=again.results, aggregate=again.aggregate)
+
+
+# --- Tables of the documents -------------------------------------------------------------------------------------
+
+
+def table_entries(board: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Entries of the test set, or of the summary of an earlier run."""
+    for table in board["tables"]:
+        if table["object_set"] == "test":
+            return [{**entry["submission"], **entry} for entry in table["entries"]]
+    return json.loads(SUMMARY.read_text(encoding="utf-8"))["entries"] if SUMMARY.is_file() else []
+
+
+def exploration_table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """Touched surface, a row per explorer."""
     lines = [
-        f"| explorer | touched voxels per pose | surface touched after {' / '.join(COUNTS)} poses | {EXPLORATION_AREA.short} |",
-        "|---|---|---|---|",
+        f"| explorer | surface touched after {' / '.join(COUNTS)} poses | {EXPLORATION_AREA.short} |",
+        "|---|---|---|",
     ]
-    seen = {}
-    for entry in kept["entries"]:
-        if entry["explorer"] in kept["touched_voxels"]:
+    seen: dict[str, Mapping[str, Any]] = {}
+    for entry in entries:
+        if "touched_surface_recall" in entry["aggregate"]["8"]:
             seen.setdefault(entry["explorer"], entry)
-    for name, entry in sorted(seen.items(), key=lambda item: -kept["touched_voxels"][item[0]]):
+    for name, entry in sorted(
+        seen.items(), key=lambda item: -item[1]["aggregate"]["areas"]["exploration_area"]["mean"]
+    ):
         groups = entry["aggregate"]
         recall = " / ".join(number(groups[count]["touched_surface_recall"]["mean"]) for count in COUNTS)
-        area = _with_interval(groups, EXPLORATION_AREA)
-        lines.append(f"| `{name}` | {kept['touched_voxels'][name]:.0f} | {recall} | {area} |")
+        lines.append(f"| `{name}` | {recall} | {_with_interval(groups, EXPLORATION_AREA)} |")
     return "\n".join(lines)
 
 
@@ -126,22 +177,25 @@ def _with_interval(groups: Mapping[str, Any], figure: Figure) -> str:
     return f"{figure.text(means(groups))} ({interval(groups[figure.group][figure.metric])})"
 
 
-def texts_of(kept: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
+def texts_of(board: Mapping[str, Any]) -> dict[Path, dict[str, str]]:
     """Page -> section -> text."""
-    short = [entry for entry in kept["entries"] if entry["reconstructor"] in README_RECONSTRUCTORS]
+    entries = table_entries(board)
+    short = [entry for entry in entries if entry["reconstructor"] in README_RECONSTRUCTORS]
     return {
-        PAGE: {"exploration": exploration_table(kept), "scores": score_table(kept["entries"])},
+        PAGE: {"exploration": exploration_table(entries), "scores": score_table(entries)},
         README: {"results": score_table(short)},
     }
 
 
 def main(config: Config) -> None:
-    """Keeps figures, writes or compares pages."""
+    """Keeps a run, writes or compares pages."""
     with one_line_errors("build_results"):
         if config.run is not None:
-            write_json(KEPT, kept_figures(config.run))
-        kept = json.loads(KEPT.read_text(encoding="utf-8"))
-        write_or_check({page: filled(page, texts) for page, texts in texts_of(kept).items()}, config.check)
+            keep(config, config.run)
+        board = kept_board()
+        pages = {page: filled(page, texts) for page, texts in texts_of(board).items()}
+        site = page_texts(board, read_pictures(SITE / PICTURES), SITE) if board["tables"] else {}
+        write_or_check(pages | {SITE / name: text for name, text in site.items()}, config.check)
 
 
 if __name__ == "__main__":

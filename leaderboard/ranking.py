@@ -18,6 +18,7 @@ from tslam_bench.constants import ENVIRONMENT_ID, PROTOCOL_VERSION
 from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.objects.splits import object_set
 from tslam_bench.scoring.aggregate import curve_intervals, interval, probability_of_improvement, resampled_means
+from tslam_bench.scoring.figures import rounded
 from tslam_bench.scoring.score_file import CURVE_SPACING, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.version import __version__
@@ -59,7 +60,7 @@ def rank(scores: Sequence[SubmissionScore], training: Sequence[Mapping[str, Any]
         "tables": tables,
         "training": list(training),
     }
-    return _rounded(board)
+    return rounded(board, DIGITS)
 
 
 def _table(group: Sequence[SubmissionScore]) -> dict[str, Any]:
@@ -196,12 +197,3 @@ def _band(score: SubmissionScore) -> dict[str, list[float]]:
         return {"low": [], "high": []}
     low, high = curve_intervals(np.array(curves).reshape(len(score.objects), -1, len(curves[0])))
     return {"low": [round(float(x), 5) for x in low], "high": [round(float(x), 5) for x in high]}
-
-
-def _rounded(value: Any) -> Any:
-    """The same plain value, its numbers with ``DIGITS`` significant digits."""
-    if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}")
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

@@ -148,19 +148,35 @@
   for (const legend of document.querySelectorAll("[data-legend]")) {
     const off = new Set();
     hiddenLines.set(legend.dataset.legend, off);
-    for (const button of legend.querySelectorAll("button")) {
+    const buttons = Array.from(legend.querySelectorAll("button"));
+    const every = document.createElement("button");
+    every.type = "button";
+    every.className = "every";
+    const update = () => {
+      for (const button of buttons) button.setAttribute("aria-pressed", String(!off.has(Number(button.dataset.line))));
+      every.textContent = off.size ? "show all" : "hide all";
+      for (const chart of charts) if (chart.legend === legend.dataset.legend && chart.shown) draw(chart);
+    };
+    for (const button of buttons) {
       button.addEventListener("click", () => {
         const line = Number(button.dataset.line);
         if (off.has(line)) off.delete(line); else off.add(line);
-        button.setAttribute("aria-pressed", String(!off.has(line)));
-        for (const chart of charts) if (chart.legend === legend.dataset.legend) draw(chart);
+        update();
       });
     }
+    every.addEventListener("click", () => {
+      if (off.size) off.clear(); else for (const button of buttons) off.add(Number(button.dataset.line));
+      update();
+    });
+    const item = document.createElement("li");
+    item.append(every);
+    legend.append(item);
+    update();
   }
 
   document.addEventListener("entries", (event) => {
     hiddenEntries.set(event.detail.table, event.detail.hidden);
-    for (const chart of charts) if (chart.table === event.detail.table) draw(chart);
+    for (const chart of charts) if (chart.table === event.detail.table && chart.shown) draw(chart);
   });
 
   for (const select of document.querySelectorAll("[data-heat]")) {

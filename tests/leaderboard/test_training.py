@@ -45,6 +45,20 @@ def test_a_point_is_the_mean_and_the_middle_of_its_bin(tmp_path: Path) -> None:
     assert curve["high"] == pytest.approx(0.9 * ordered[:, 8] + 0.1 * ordered[:, 9], abs=1e-3)
 
 
+def test_records_of_shipped_weights_are_read_too(tmp_path: Path) -> None:
+    for seed, first in ((0, 10.0), (1, 20.0)):
+        about = {
+            "baseline": "tslam",
+            "seed": seed,
+            "curve": {"steps": [100, 200], "touched_voxels": [first, first + 5]},
+        }
+        (tmp_path / f"tslam-{seed}.json").write_text(json.dumps(about))
+        (tmp_path / f"tslam-{seed}.safetensors").touch()
+    (tmp_path / "notes.json").write_text("{}")
+    (curve,) = read_records(find_records([tmp_path]))
+    assert (curve["explorer"], curve["runs"], curve["steps"], curve["mean"]) == ("tslam", 2, [200], [17.5])
+
+
 def test_short_runs_and_iterations_without_an_episode(tmp_path: Path) -> None:
     folders = [
         record(tmp_path / "b", "tslam_knn", np.array([np.nan, 2.0, 4.0])),

@@ -81,3 +81,12 @@ def number(value: float | None, digits: int = 3) -> str:
 def interval(estimate: Mapping[str, Any], digits: int = 3) -> str:
     """The 95 % interval of an estimate as it is shown."""
     return f"{estimate['low']:.{digits}f} to {estimate['high']:.{digits}f}"
+
+
+def rounded(value: Any, digits: int) -> Any:
+    """The same plain value, its numbers with so many significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}")
+    if isinstance(value, dict):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    return [rounded(item, digits) for item in value] if isinstance(value, list | tuple) else value

@@ -97,7 +97,7 @@ class SubmissionScore:
             "own_run": self.own_run,
             "objects": list(self.objects),
             "asset_sha256": self.asset_sha256,
-            "results": [dataclasses.asdict(result) for result in self.results],
+            "results": [dict(vars(result)) for result in self.results],  # asdict would copy every figure
             "aggregate": {
                 group: {name: dataclasses.asdict(estimate) for name, estimate in estimates.items()}
                 for group, estimates in self.aggregate.items()

@@ -9,6 +9,7 @@ import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -168,7 +169,7 @@ def _entries(
     ordered = {name: {p: own[p] for p in EXPLORATION_ORDER if p in own} for name, own in explored.items()}
     keys = {name: episodes_key(rollouts) for name, rollouts in ordered.items()}
 
-    def read(name: str, reconstructor: Reconstructor | None) -> Explored:
+    def read(reconstructor: Reconstructor | None, name: str) -> Explored:
         rollouts, members = ordered[name], members_of(list(ordered[name]))
         shapes: dict[int, Any] = dict.fromkeys(members)
         if reconstructor is not None:
@@ -179,6 +180,7 @@ def _entries(
         return Explored(name, parsed.split, control_mode, rollouts, tuple(rollouts), members, shapes)
 
     whole = hashlib.sha256("".join(keys.values()).encode()).hexdigest()[:16]
+    none: dict[str, Reconstructor | None] = {"none": None}
     return [
         Entry(
             key=f"{whole}-{label}",
@@ -188,9 +190,9 @@ def _entries(
             objects=tuple(ordered),
             stored=False,
             episodes=keys.__getitem__,
-            read=lambda name, made=made: read(name, made),
+            read=partial(read, made),
         )
-        for label, made in (reconstructors or {"none": None}).items()
+        for label, made in (dict(reconstructors) or none).items()
     ]
 
 

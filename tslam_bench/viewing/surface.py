@@ -26,8 +26,10 @@ NODES: Final = 64
 """Nodes per axis at which a reconstruction is looked at: 3.9 mm apart."""
 PLACES: Final = 64
 """Places within a cell, per axis, that a vertex can have."""
-ERROR_STEP: Final = 0.2e-3
-"""Errors are stored in steps of this (m), up to 127 of them."""
+ERROR_STEP: Final = 0.4e-3
+"""Errors are stored in steps of this (m)."""
+MOST_STEPS: Final = 63
+"""Largest stored error, in steps: 25 mm."""
 FINE: Final = 10e-3
 """Longest edge (m) of a true mesh's triangles, so that colours of corners tell where the error is."""
 _MOST_WORK: Final = 1000.0
@@ -177,4 +179,4 @@ def signed_distances(points: NDArray, vertices: NDArray, faces: NDArray) -> NDAr
 
 def stored_errors(distances: NDArray) -> NDArray[np.int8]:
     """Distances (m) in steps of ``ERROR_STEP``, larger ones as the largest."""
-    return np.clip(np.round(distances / ERROR_STEP), -127, 127).astype(np.int8)
+    return np.clip(np.round(distances / ERROR_STEP), -MOST_STEPS, MOST_STEPS).astype(np.int8)

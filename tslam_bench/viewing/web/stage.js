@@ -31,7 +31,7 @@
       this.panels = panels;
       for (const { scene } of panels) {
         if (scene.userData.lamp) continue;
-        scene.add(new THREE.HemisphereLight(0xffffff, 0x8a8f98, 1.5));
+        scene.add(new THREE.HemisphereLight(0xffffff, 0xa8adb5, 1.7));
         scene.userData.lamp = new THREE.DirectionalLight(0xffffff, 2.1);
         scene.add(scene.userData.lamp, scene.userData.lamp.target);
       }

@@ -97,7 +97,7 @@
       return button;
     }));
     stage.show([{ element: byId("world"), scene: player.scene }]);
-    if (fresh || shapes) stage.home({ azimuth: 40, elevation: 22, radius: 0.215, target: [0, -0.045, 0.03] });
+    if (fresh || shapes) stage.home({ azimuth: 40, elevation: 22, radius: 0.2, target: [0, -0.045, 0.035] });
     shapes = null;
     choosePose(state.pose, state.time);
     player.truth.visible = byId("show-true").checked;

@@ -16,6 +16,7 @@ _COMMANDS = {
     "baselines": ("tslam_bench.baselines.commands", "main", "list and train the registered policies"),
     "reconstruct": ("tslam_bench.cli.reconstruct", "main", "list, train and run reconstructors"),
     "evaluate": ("tslam_bench.cli.evaluate", "main", "let a policy explore, reconstruct, and write submissions"),
+    "view": ("tslam_bench.cli.view", "main", "watch episodes and turn shapes in the browser"),
     "verify": ("tslam_bench.cli.verify", "main", "replay a submission's rollouts and record which reproduce"),
     "score": ("tslam_bench.cli.score", "score_main", "score submissions: a table and JSON"),
     "leaderboard": ("tslam_bench.leaderboard.commands", "page_main", "rank scored submissions and build the page"),

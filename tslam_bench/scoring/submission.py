@@ -82,6 +82,10 @@ class Submission:
         """The episodes whose rollouts it holds, sorted."""
         return sorted(episode for name in self._digests if (episode := _episode(name)) is not None)
 
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects that it holds anything of, sorted."""
+        return tuple(sorted({name for file in self._digests if (name := _object_of(file)) is not None}))
+
     def of_object(self, object_name: str) -> Submission:
         """The same submission with the files of one object only: less to send to another process."""
         own = {name: digest for name, digest in self._digests.items() if _object_of(name) == object_name}

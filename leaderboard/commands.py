@@ -56,6 +56,8 @@ class LeaderboardArguments:
     trust_scores: bool = False
     """Take the figures of score files that were made elsewhere as they are, even where their submissions are at hand and
     could be scored. They never count as replayed."""
+    split: str = "test"
+    """Split that the submissions are of; pictures are drawn of the test split."""
     pictured: int = 12
     """Objects in the gallery, the quick ones first; 0 leaves the gallery out."""
     workers: int = 1
@@ -86,7 +88,7 @@ def page_main(arguments: Sequence[str]) -> None:
     submissions: dict[str, Submission] = {}
     for path in submission_paths:
         with batch.item(str(path)):
-            submission = read_submission(path)
+            submission = read_submission(path, split=parsed.split)
             submissions.setdefault(submission.content_hash, submission)
     if not scores and not submissions:
         batch.finish("there is nothing to show")
@@ -102,7 +104,7 @@ def page_main(arguments: Sequence[str]) -> None:
             records.append(path)
     leaderboard = rank(scores, read_records(records))
 
-    pictures = plan_pictures(leaderboard, submissions, parsed.pictured)
+    pictures = plan_pictures(leaderboard, submissions, parsed.pictured if parsed.split == "test" else 0)
     with Progress("pictures", "picture", leave=False) as bar:
         drawn = make_pictures(
             list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, bar.show
@@ -232,8 +234,9 @@ def _is_current(score: SubmissionScore, submission: Submission | None, trust: bo
     if not (score.made_here or trust):
         return False
     try:
-        if not score.verified and find_record(submission, score.objects)[0] is not None:
+        record = find_record(submission, score.objects)[0]
+        if record is not None and record.tier != score.tier:
             return False
-        return score.asset_sha256 == asset_sha256(score.objects)
+        return score.asset_sha256 == asset_sha256(score.objects, submission.split)
     except AssetError:
         return True  # the objects are not here: the score is the best there is

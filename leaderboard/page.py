@@ -21,7 +21,6 @@ from markupsafe import Markup
 
 from tslam_bench import constants
 from tslam_bench.scoring.figures import EXPLORATION_AREA, FIGURES, IOU_AREA, interval, means, number
-from tslam_bench.scoring.info import OBJECT_SETS
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.text import visible
 
@@ -39,6 +38,8 @@ COUNTS: Final = tuple(RECONSTRUCTED_POSES)
 TIERS: Final = {
     "reported": "nothing was replayed: touches are the submitter's word",
     "replayed": "the actions were simulated again: touches and exploration figures are the replay's",
+    "attested": "policy and reconstructor ran at the organiser's: they give these actions and shapes, and hold in fresh episodes",
+    "hidden": "attested, on objects that nobody had seen",
 }
 """Tier of an entry -> what it means, from the least to the most trustworthy."""
 VIEWS: Final = {
@@ -157,7 +158,7 @@ def _table_view(
     entries = table["entries"]
     explorers = group_explorers(entries)
     reconstructors = sorted({entry["submission"]["reconstructor"] for entry in entries})
-    kind = table["object_set"] if table["object_set"] in OBJECT_SETS else "chosen"
+    kind = "chosen" if table["object_set"] == "custom" else table["object_set"]
     count = len(table["objects"])
     set_name = f"{count} {kind} object{'' if count == 1 else 's'}"
     shown = [

@@ -19,7 +19,8 @@ from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.objects.splits import object_set
 from tslam_bench.scoring.aggregate import curve_intervals, interval, probability_of_improvement, resampled_means
 from tslam_bench.scoring.figures import rounded
-from tslam_bench.scoring.score_file import CURVE_SPACING, SubmissionScore
+from tslam_bench.scoring.info import OBJECT_SETS
+from tslam_bench.scoring.score_file import CURVE_SPACING, TIERS, SubmissionScore
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES
 from tslam_bench.version import __version__
 
@@ -72,7 +73,7 @@ def _table(group: Sequence[SubmissionScore]) -> dict[str, Any]:
         for score, (position, difference) in zip(ordered, shared_ranks(ordered), strict=True)
     ]
     return {
-        "object_set": name if set(objects) == set(object_set(name)) else "custom",
+        "object_set": name if name not in OBJECT_SETS or set(objects) == set(object_set(name)) else "custom",
         "objects": sorted(objects),
         "entries": entries,
     }
@@ -118,7 +119,7 @@ def _sort_key(score: SubmissionScore) -> tuple[Any, ...]:
 
 def _doubt(score: SubmissionScore) -> tuple[Any, ...]:
     """Lower for figures that were made here, and of a replay; and what differs at all is told apart by its text."""
-    return not score.made_here, not score.verified, json.dumps(score.to_json(), sort_keys=True)
+    return not score.made_here, -TIERS.index(score.tier), json.dumps(score.to_json(), sort_keys=True)
 
 
 def _entry(
@@ -130,9 +131,8 @@ def _entry(
         results[result.object].append(result)
     written = score.to_json()
     return {
-        **{name: written[name] for name in ("submission", "content_hash", "verified", "aggregate", "notes")},
+        **{name: written[name] for name in ("submission", "content_hash", "verified", "tier", "aggregate", "notes")},
         "claimed": _claimed(score),
-        "tier": "replayed" if score.verified else "reported",
         "rank": position,
         "behind_leader": difference,
         "improvement": _improvement(score, group),

@@ -59,11 +59,16 @@ def test_what_was_made_here_is_read_back(value: Any, tmp_path: Path) -> None:
 
 
 def test_only_what_was_verified_here_is_verified(value: Any, foreign: Any, monkeypatch, tmp_path: Path) -> None:
-    assert not parse_score({**foreign, "verified": True}, "file").verified
-    assert not parse_score({**value, "verified": True}, "file").verified  # the seal is of other content
-    sealed = {**foreign, "verified": True}
+    claim = {"verified": True, "tier": "attested"}
+    assert not parse_score({**foreign, **claim}, "file").verified
+    assert not parse_score({**value, **claim}, "file").verified  # the seal is of other content
+    sealed = {**foreign, **claim}
     sealed["seal"] = seal(sealed)
-    assert parse_score(sealed, "file").verified
+    assert parse_score(sealed, "file").verified and parse_score(sealed, "file").tier == "attested"
+    older = {
+        name: field for name, field in sealed.items() if name not in ("tier", "seal")
+    }  # from before there were tiers
+    assert parse_score({**older, "seal": seal(older)}, "file").tier == "replayed"
     for claimed in ("", "0" * 64, None, 7, sealed["seal"][:-1], "\u00e9"):
         assert not parse_score({**sealed, "seal": claimed}, "file").made_here
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))  # another user, or another machine

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tslam_bench.cli.commands import run_command
+from tslam_bench.cli.hide import Hide, hide
 from tslam_bench.cli.progress import Progress
 from tslam_bench.cli.terminal import cell
 from tslam_bench.constants import DEFAULT_SPLIT
@@ -145,6 +146,7 @@ def main(arguments: Sequence[str]) -> None:
         "verify": (Verify, _verify),
         "pack": (Pack, _pack),
         "unpack": (Unpack, _unpack),
+        "hide": (Hide, lambda command: hide(command, _show_progress)),
     }
     run_command(
         "tslam-bench assets", "The benchmark's objects and its hand, and meshes of your own.", commands, arguments

@@ -33,7 +33,9 @@ class Evaluate:
     reconstructor: tuple[str, ...] = ("grid", "hull")
     """Reconstructors (tslam-bench reconstruct list): ID, module:Class, or either with =MODEL; none only explores."""
     objects: tuple[str, ...] = ()
-    """Objects of the test split; empty: those of the object set."""
+    """Objects of the split; empty: those of the object set."""
+    split: str = "test"
+    """Split; one of your own (tslam-bench assets hide, or import), or val, is one object set as a whole."""
     object_set: Literal["quick", "test"] = "quick"
     """Which ranking the submissions are for: the five quick objects or the whole test split."""
     seeds: tuple[int, ...] = (0,)
@@ -77,6 +79,7 @@ def main(arguments: Sequence[str]) -> None:
             parsed.objects,
             parsed.output,
             object_set=parsed.object_set,
+            split=parsed.split,
             seeds=parsed.seeds,
             arguments=policy_arguments,
             model=parsed.model,

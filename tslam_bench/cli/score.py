@@ -36,6 +36,8 @@ class ScoreArguments:
     """JSON file for the scores; with several submissions, a folder that gets one file each, as soon as it is scored."""
     objects: tuple[str, ...] = ()
     """Objects to score; empty: those of the submission's object set."""
+    split: str = "test"
+    """Split that the submissions are of: test, or an organiser's own (tslam-bench assets hide)."""
     verification: tuple[Path, ...] = ()
     """Records of tslam-bench verify, one for each submission that has one; default: SUBMISSION.verification.json beside it."""
     workers: int = 1
@@ -59,7 +61,7 @@ def score_main(arguments: Sequence[str]) -> None:
     submissions: dict[Path, Submission] = {}
     for path in parsed.submissions:  # all of them first: what is refused is known before hours of scoring, not after
         with batch.item(str(path)):
-            submissions[path] = read_submission(path)
+            submissions[path] = read_submission(path, split=parsed.split)
     records = _records(parsed.verification, submissions.values())
     scores: list[SubmissionScore] = []
     unwritten: list[BenchmarkError] = []

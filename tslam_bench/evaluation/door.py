@@ -15,6 +15,7 @@ def evaluate(
     output: str | Path = "runs/evaluation",
     *,
     object_set: Literal["quick", "test"] = "quick",
+    split: str = "test",
     seeds: Sequence[int] = (0,),
     arguments: Mapping[str, Any] | None = None,
     model: str | Path | None = None,
@@ -36,9 +37,10 @@ def evaluate(
             and ``arguments``, or another ``output`` for other settings.
         reconstructors: each an id, ``ID=MODEL``, ``module:name`` or ``module:name=MODEL``, a class or function, or a
             reconstructor; ``("none",)`` only explores.
-        objects: objects of the test split; empty: those of the object set.
+        objects: objects of the split; empty: those of the object set.
         output: folder for ``rollouts/`` and ``submissions/``.
         object_set: which ranking the submissions are for: the five quick objects or the whole test split.
+        split: ``test``, or another split, whose objects are all one set: the organiser's own, or ``val`` for tuning.
         seeds: repetitions; each is 8 episodes per object.
         arguments: keyword arguments of the policy's class or function; recorded.
         model: handed to it as ``model``; the hash of its content is recorded.
@@ -60,13 +62,15 @@ def evaluate(
         AssetError: an object is not prepared, or ``output`` cannot be written.
     """
     from tslam_bench.evaluation import evaluate as evaluation
+    from tslam_bench.objects.splits import SPLIT_ALIASES
     from tslam_bench.objects.splits import object_set as objects_of
 
+    chosen = object_set if SPLIT_ALIASES.get(split, split) == "test" else split
     config = evaluation.EvaluationConfig(
         policy=policy,
-        objects=tuple(objects) or objects_of(object_set),
+        objects=tuple(objects) or objects_of(chosen),
         seeds=tuple(seeds),
-        object_set=object_set,
+        object_set=chosen,
         model=None if model is None else Path(model),
         arguments=dict(arguments or {}),
         policy_salt=policy_salt,

@@ -18,7 +18,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from tslam_bench.evaluation.weights import shipped_weights, training_record
 from tslam_bench.files import ensure_writable_directory, write_json
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.hand_constants import CONTROL_MODES
-from tslam_bench.objects.splits import object_set, resolve_name
+from tslam_bench.objects.splits import check_split, object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256, load_object
 from tslam_bench.reconstruction.registry import (
     ReconstructorSpec,
@@ -50,7 +50,7 @@ from tslam_bench.reconstruction.registry import (
 )
 from tslam_bench.reconstruction.volume import Reconstructor
 from tslam_bench.registration import make_vec
-from tslam_bench.scoring.info import SubmissionInfo, Training
+from tslam_bench.scoring.info import OBJECT_SETS, SubmissionInfo, Training
 from tslam_bench.scoring.origin import write_origin
 from tslam_bench.scoring.rollout import Rollout, rollout_file
 from tslam_bench.scoring.submission import RECONSTRUCTED_POSES, SubmissionWriter, read_submission
@@ -70,9 +70,9 @@ class EvaluationConfig:
 
     Attributes:
         policy: registered id, ``module:Class``, a class or function, or a policy that is already made.
-        objects: objects of the test split; aliases are resolved.
+        objects: objects of the split; aliases are resolved.
         seeds: repetitions; each is 8 episodes per object.
-        object_set: ``quick`` or ``test``: which ranking the submissions are for.
+        object_set: ``quick`` or ``test``: which ranking the submissions are for; of another split its name.
         model: directory of the trained model of a learned baseline, or a file of weights; or what a policy of the user's
             reads. None lets a learned baseline play repetition s with the shipped weights of training seed s.
         arguments: handed to the policy's class or function.
@@ -82,13 +82,14 @@ class EvaluationConfig:
         authors: whose submission it is.
         privileged: the policy saw or was rewarded with the true shape; known of registered ones.
         processes: worker processes that simulate; None means the cores. Results do not depend on it.
+        split: of the objects; follows from ``object_set``.
         spec: what ``policy`` is.
     """
 
     policy: Any
     objects: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
-    object_set: Literal["quick", "test"] = "test"
+    object_set: str = "test"
     model: Path | None = None
     arguments: Mapping[str, Any] = field(default_factory=dict)
     policy_salt: str | None = None
@@ -96,6 +97,7 @@ class EvaluationConfig:
     authors: tuple[str, ...] = ("The tslam-bench authors",)
     privileged: bool = False
     processes: int | None = None
+    split: str = field(init=False)
     spec: PolicySpec = field(init=False)
 
     def __post_init__(self) -> None:
@@ -110,7 +112,9 @@ class EvaluationConfig:
             raise InvalidInputError("evaluation: give at least one object and one seed")
         if min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError(f"seeds {list(self.seeds)}: must be different and not negative")
-        object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name) for name in self.objects)))
+        split = check_split("test" if self.object_set in OBJECT_SETS else self.object_set)
+        object.__setattr__(self, "split", split)
+        object.__setattr__(self, "objects", tuple(dict.fromkeys(resolve_name(name, split) for name in self.objects)))
 
 
 @dataclass(frozen=True)
@@ -187,9 +191,9 @@ def evaluate(
         with SubmissionWriter(submission, submission_info(config, name, source)) as writer:
             total = len(config.objects) * len(config.seeds)
             for done, (object_name, seed) in enumerate(_repetitions(config)):
-                _add_object(writer, spec, folder, reconstructor.made, object_name, seed)
+                _add_object(writer, config, folder, reconstructor.made, object_name, seed)
                 report(f"reconstruct {name}", done + 1, total)
-        write_origin(read_submission(submission))
+        write_origin(read_submission(submission, split=config.split))
         submissions.append(submission)
     return submissions
 
@@ -223,7 +227,7 @@ def explore(config: EvaluationConfig, folder: Path, report: Callable[[str, int, 
         width,
         "cpu",
         objects=config.objects,
-        split="test",
+        split=config.split,
         control_mode=modes[0],
         processes=config.processes,
     )
@@ -259,7 +263,7 @@ def merged_grids(rollouts: Sequence[Rollout]) -> Grids:
     return touched, visited
 
 
-def reference_grids(identifier: str, object_name: str) -> Grids:
+def reference_grids(identifier: str, object_name: str, split: str = "test") -> Grids:
     """Grids of a reference explorer in the object frame.
 
     ``oracle``: every voxel that the true surface crosses is touched, every voxel whose centre is outside is visited.
@@ -267,7 +271,7 @@ def reference_grids(identifier: str, object_name: str) -> Grids:
     """
     if identifier == "nothing":
         return np.zeros((GRID_SIZE,) * 3, dtype=bool), np.zeros((GRID_SIZE,) * 3, dtype=bool)
-    prepared = load_object(object_name)
+    prepared = load_object(object_name, split)
     return prepared.surface.copy(), ~prepared.solid
 
 
@@ -278,9 +282,9 @@ def manifest_sha256(config: EvaluationConfig) -> str:
         AssetError: an evaluated object is not prepared.
     """
     try:
-        return asset_sha256(object_set(config.object_set))
+        return asset_sha256(object_set(config.object_set), config.split)
     except AssetError:
-        return asset_sha256(config.objects)
+        return asset_sha256(config.objects, config.split)
 
 
 def submission_info(config: EvaluationConfig, reconstructor: str, source: Mapping[str, Any]) -> SubmissionInfo:
@@ -323,7 +327,7 @@ def submission_info(config: EvaluationConfig, reconstructor: str, source: Mappin
 
 def _add_object(
     writer: SubmissionWriter,
-    spec: PolicySpec,
+    config: EvaluationConfig,
     folder: Path,
     reconstructor: Reconstructor,
     object_name: str,
@@ -331,9 +335,9 @@ def _add_object(
 ) -> None:
     """Adds one object's rollouts and reconstructions, those that are not there yet."""
     missing = [n for n in RECONSTRUCTED_POSES if not writer.has_reconstruction(object_name, n, seed)]
-    if spec.kind == "reference":
+    if config.spec.kind == "reference":
         if missing:
-            volume = reconstructor.reconstruct(*reference_grids(spec.id, object_name))
+            volume = reconstructor.reconstruct(*reference_grids(config.spec.id, object_name, config.split))
             for count in missing:
                 writer.add_reconstruction(object_name, count, seed, volume)
         return
@@ -357,7 +361,7 @@ def _source(config: EvaluationConfig, control_mode: str, salt: str) -> dict[str,
         **policy_source(config.policy, dict(config.arguments), config.model),
         "control_mode": control_mode,
         "policy_salt": salt,
-        "asset_manifest_sha256": asset_sha256(config.objects),
+        "asset_manifest_sha256": asset_sha256(config.objects, config.split),
         "package_version": __version__,
         "environment": ENVIRONMENT_ID,
     }

@@ -26,7 +26,7 @@ from tslam_bench.episodes import Episode, episode_seed
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.hand_constants import JOINT_LIMITS
 from tslam_bench.machine import processor_name
-from tslam_bench.objects.splits import OBJECTS
+from tslam_bench.objects.splits import known_names
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.rollout import CHECKPOINT_SPACING, Rollout
 from tslam_bench.scoring.scoring import WorkerDied, worker_pool
@@ -63,6 +63,7 @@ def verify(
     segments: Tolerances | None = None,
     processes: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
+    split: str = "test",
 ) -> VerificationRecord:
     """Replays every rollout of a submission and writes a record, after each object; one that is there is gone on with.
 
@@ -72,13 +73,14 @@ def verify(
         segments: replay in segments within these tolerances; None: bit for bit.
         processes: that replay. The verdicts do not depend on it.
         on_progress: called with (done, all) episodes.
+        split: of the submission's objects.
 
     Raises:
         InvalidInputError: the submission is refused, or holds no rollouts.
         AssetError: an object is not prepared, or the record cannot be written.
         WorkerError: a process died; what is finished is kept.
     """
-    submission = read_submission(path)
+    submission = read_submission(path, split=split)
     episodes = submission.episodes()
     if not episodes:
         raise InvalidInputError(f"{submission.location}: holds no rollouts, so there is nothing to replay")
@@ -86,13 +88,16 @@ def verify(
     if file.resolve().is_relative_to(Path(path).resolve()):
         raise InvalidInputError(f"{file}: inside the submission, which it would change; choose another --output")
     objects = list(dict.fromkeys(name for name, _, _ in episodes))
-    assets = {name: asset_sha256([name]) for name in objects}  # fails before the work if one is not prepared
+    assets = {
+        name: asset_sha256([name], submission.split) for name in objects
+    }  # fails before the work if one is not prepared
     record = _begun(submission, file, segments)
     kept = {name for name, product in record.assets.items() if assets.get(name) == product}
     record = dataclasses.replace(
         record,
         assets={name: assets[name] for name in kept},
         verdicts=tuple(verdict for verdict in record.verdicts if verdict.object in kept),
+        attestation=record.attestation if len(kept) == len(objects) else None,
     )
     report = on_progress or (lambda done, total: None)
     report(len(record.verdicts), len(episodes))
@@ -118,6 +123,7 @@ def _begun(submission: Submission, file: Path, segments: Tolerances | None) -> V
         processor=processor_name(),
         simulator=f"sapien {importlib.metadata.version('sapien')}",
         verdicts=(),
+        split=submission.split,
     )
     if not file.is_file():
         return empty
@@ -147,7 +153,7 @@ def _verify_part(part: Submission, segments: Tolerances | None, width: int) -> l
     episodes, verdicts = part.episodes(), []
     for first in range(0, len(episodes), width):
         rollouts = [_stored(part, episode) for episode in episodes[first : first + width]]
-        found = replay(rollouts, part.info.control_mode, segments is not None, width)
+        found = replay(rollouts, part.info.control_mode, segments is not None, width, part.split)
         verdicts += [judge(rollout, found, row, segments) for row, rollout in enumerate(rollouts)]
     return verdicts
 
@@ -159,12 +165,19 @@ def _stored(part: Submission, episode: Episode) -> Rollout:
 
 
 @lru_cache(maxsize=2)
-def _hands(width: int, control_mode: str) -> HandBatch:
-    settings = BatchSettings(objects=tuple(OBJECTS), split="test", control_mode=control_mode, reward_mode="contact")
+def _hands(width: int, control_mode: str, split: str) -> HandBatch:
+    names = tuple(known_names(split))
+    settings = BatchSettings(objects=names, split=split, control_mode=control_mode, reward_mode="contact")
     return HandBatch(width, settings, autoreset=False)
 
 
-def replay(rollouts: Sequence[Rollout], control_mode: str, segments: bool = False, width: int | None = None) -> Replay:
+def replay(
+    rollouts: Sequence[Rollout],
+    control_mode: str,
+    segments: bool = False,
+    width: int | None = None,
+    split: str = "test",
+) -> Replay:
     """Plays the actions of rollouts, of any objects and poses, side by side in this process.
 
     Args:
@@ -172,10 +185,11 @@ def replay(rollouts: Sequence[Rollout], control_mode: str, segments: bool = Fals
         control_mode: of the actions.
         segments: put the joints where the rollout says they were after every ten steps.
         width: hands in the batch, by default as many as needed. One batch is kept and reused.
+        split: of the objects.
     """
     width = width or len(rollouts)
     played = [*rollouts, *[rollouts[-1]] * (width - len(rollouts))]
-    hands = _hands(width, control_mode)
+    hands = _hands(width, control_mode, split)
     hands.reset(
         [episode_seed(rollout.pose, rollout.seed) for rollout in played],
         range(width),

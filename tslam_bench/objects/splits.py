@@ -112,9 +112,9 @@ PAPER60: tuple[str, ...] = tuple(sorted([*OBJECTS, *ALIASES, *EXCLUDED]))
 """The paper's 60 names: 50 objects, 5 duplicates, and the 5 that are excluded. For comparison only."""
 
 
-def object_set(name: str) -> tuple[str, ...]:
-    """Objects of a ranking: the five of the quick run (``quick``), or the whole test split."""
-    return QUICK_OBJECTS if name == "quick" else tuple(sorted(OBJECTS))
+def object_set(name: str, cache: Path | None = None) -> tuple[str, ...]:
+    """Objects of a ranking: the five of the quick run (``quick``), or all of a split (``test``, an organiser's own)."""
+    return QUICK_OBJECTS if name == "quick" else tuple(known_names(name, cache))
 
 
 def check_split(split: str, cache: Path | None = None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +41,17 @@ def write(path: Path, split: str, records: Sequence[dict[str, Any]], rejected: d
 
 def _short(record: dict[str, Any]) -> dict[str, Any]:
     """A record without what only the files beside it need, and with one hash and the size of all of them."""
-    products = {name: stated["sha256"] for name, stated in record["products"].items()}
     short = {key: value for key, value in record.items() if key not in ("products", "decomposition", "field")}
     return short | {
-        "products_sha256": hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest(),
+        "products_sha256": products_sha256(record),
         "bytes": sum(stated["bytes"] for stated in record["products"].values()),
     }
+
+
+def products_sha256(record: Mapping[str, Any]) -> str:
+    """Hash over the hashes of an object's products."""
+    products = {name: stated["sha256"] for name, stated in record["products"].items()}
+    return hashlib.sha256(json.dumps(products, sort_keys=True).encode()).hexdigest()
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import re
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from tslam_bench.constants import (
     ENVIRONMENT_ID,
@@ -24,9 +24,10 @@ from tslam_bench.text import CONTROL
 SCHEMA_VERSION: Final = 2
 """Version of the submission format. 2: rollouts hold joint checkpoints."""
 OBJECT_SETS: Final = ("quick", "test")
-"""What a submission covers: the five quick objects or the whole test split."""
+"""What a submission covers: the five quick objects or the whole test split; one of another split names that."""
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_SPLIT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _SALT = re.compile(r"[0-9a-fA-F]{1,64}")
 _STATED = ("schema_version", "protocol_version", "environment_id", "control_mode", "policy_salt")
 """Fields that have a default for who writes a submission; a file has to state them."""
@@ -61,7 +62,7 @@ class SubmissionInfo:
         authors: names, at least one.
         asset_manifest_sha256: hash of the asset manifest that the rollouts were made with, 64 hexadecimal digits.
         seeds: episode seeds, each with its own rollouts and reconstructions.
-        object_set: ``"quick"`` or ``"test"``: submissions are ranked within one set.
+        object_set: ``"quick"`` or ``"test"``, or the name of another split: submissions are ranked within one set.
         privileged: anything the policy saw or was rewarded with derives from the true mesh.
         reward_mode: reward the policy was trained with (``REWARD_MODES``), or None for another or no reward.
         control_mode: mode (``CONTROL_MODES``) that the rollouts' actions are of.
@@ -82,7 +83,7 @@ class SubmissionInfo:
     authors: tuple[str, ...]
     asset_manifest_sha256: str
     seeds: tuple[int, ...]
-    object_set: Literal["quick", "test"]
+    object_set: str
     privileged: bool
     package_version: str
     reward_mode: str | None = None
@@ -132,8 +133,10 @@ class SubmissionInfo:
             _integer(seed, "seeds", 0, _MAX_SEED)
         if len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError("seeds: the same seed is listed twice")
-        if self.object_set not in OBJECT_SETS:
-            raise InvalidInputError(f"object_set {_shown(self.object_set)}: choose one of {', '.join(OBJECT_SETS)}")
+        if not _SPLIT.fullmatch(_text(self.object_set, "object_set")):
+            raise InvalidInputError(
+                f"object_set {_shown(self.object_set)}: choose one of {', '.join(OBJECT_SETS)}, or give the name of another split"
+            )
         if not isinstance(self.privileged, bool):
             raise InvalidInputError(f"privileged is {self.privileged!r}; expected true or false")
         if self.reward_mode is not None and self.reward_mode not in REWARD_MODES:
@@ -162,6 +165,11 @@ class SubmissionInfo:
             if self.reward_mode in PRIVILEGED_REWARD_MODES:
                 used = f"reward mode {_shown(self.reward_mode)}"
             raise InvalidInputError(f"privileged is false, but {used} counts as privileged; set privileged to true")
+
+    @property
+    def split(self) -> str:
+        """The split that its objects are of."""
+        return "test" if self.object_set in OBJECT_SETS else self.object_set
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for ``submission.json``."""

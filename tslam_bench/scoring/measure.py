@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +18,14 @@ from tslam_bench.geometry.sampling import IouPoints
 from tslam_bench.objects.store import PreparedObject, load_object
 from tslam_bench.reconstruction.volume import Volume
 from tslam_bench.scoring import metrics
-from tslam_bench.scoring.flags import right_where_unfelt, unfelt_surface
+from tslam_bench.scoring.flags import (
+    FEWEST_TOUCHES,
+    Evidence,
+    grid_ceiling,
+    outline,
+    right_where_unfelt,
+    unfelt_surface,
+)
 from tslam_bench.scoring.prediction import prepare
 from tslam_bench.scoring.rollout import Rollout
 from tslam_bench.scoring.score_file import CURVE_SPACING, ObjectScore
@@ -55,18 +63,21 @@ class Truth:
     iou_points: IouPoints
     surface: metrics.NearestSamples
     coverage: metrics.TouchCoverage
+    ceiling: float
 
     @staticmethod
     def of(prepared: PreparedObject) -> Truth:
         """Ground truth from a prepared object."""
         surface = metrics.NearestSamples(metrics.to_metric(prepared.surface_points))
-        return Truth(prepared, prepared.iou_points(), surface, metrics.TouchCoverage(prepared.surface_points))
+        points = prepared.iou_points()
+        ceiling = grid_ceiling(prepared.solid_at_iou_points, points)
+        return Truth(prepared, points, surface, metrics.TouchCoverage(prepared.surface_points), ceiling)
 
 
 @lru_cache(maxsize=64)
-def load_truth(name: str, cache: Path | None = None) -> Truth:
-    """Ground truth of a test object from the asset cache."""
-    return Truth.of(load_object(name, cache=cache))
+def load_truth(name: str, cache: Path | None = None, split: str = "test") -> Truth:
+    """Ground truth of an object from the asset cache."""
+    return Truth.of(load_object(name, split, cache))
 
 
 def score_object(submission: Submission, truth: Truth, record: VerificationRecord | None = None) -> list[ObjectScore]:
@@ -79,8 +90,8 @@ def score_object(submission: Submission, truth: Truth, record: VerificationRecor
 
 def score_seeds(
     submission: Submission, truth: Truth, record: VerificationRecord | None = None
-) -> list[tuple[ObjectScore, float | None]]:
-    """:func:`score_object`, and how right the shape of one pose is where nothing was felt (:func:`right_where_unfelt`)."""
+) -> list[tuple[ObjectScore, Evidence]]:
+    """:func:`score_object`, and what flags are made of."""
     scorer = _Scorer(truth)
     return [_score_seed(submission, scorer, seed, record) for seed in submission.info.seeds]
 
@@ -106,13 +117,13 @@ def _same(first: Volume, second: Volume) -> bool:
 
 def _score_seed(
     submission: Submission, scorer: _Scorer, seed: int, record: VerificationRecord | None
-) -> tuple[ObjectScore, float | None]:
+) -> tuple[ObjectScore, Evidence]:
     truth = scorer.truth
     name = truth.prepared.name
     rollouts = {pose: submission.rollout(name, pose, seed) for pose in EXPLORATION_ORDER}
     reference = submission.info.privileged and not any(rollouts.values())
     missing = [] if reference else [f"rollout of pose {pose}" for pose, rollout in rollouts.items() if rollout is None]
-    stored = {pose for pose, rollout in rollouts.items() if rollout is not None}
+    stored = {pose: rollout for pose, rollout in rollouts.items() if rollout is not None}
     if record is not None:
         rollouts = {p: None if rollout is None else record.replayed(rollout) for p, rollout in rollouts.items()}
     touched_step = merge_touched_steps(rollouts)
@@ -134,8 +145,8 @@ def _score_seed(
         if reconstruction is None:
             missing.append(f"reconstruction of {count} pose{'s' if count > 1 else ''}")
         elif absent and not reference:
-            why = "did not reproduce" if stored.issuperset(absent) else "are missing or did not reproduce"
-            why = "are missing" if stored.isdisjoint(absent) else why
+            why = "did not reproduce" if stored.keys() >= set(absent) else "are missing or did not reproduce"
+            why = "are missing" if stored.keys().isdisjoint(absent) else why
             reason = f"rollouts of poses {', '.join(map(str, absent))} {why}"
             reconstruction = None
         shape, found, completeness = scorer.score(reconstruction)
@@ -163,7 +174,26 @@ def _score_seed(
         implausible_touches=implausible_touches(touched_step >= 0, truth.prepared),
         missing=missing,
     )
-    return score, right
+    iou_8 = poses[str(max(RECONSTRUCTED_POSES))]["iou"]
+    evidence = Evidence(
+        right=right,
+        excess=None if reference or iou_8 is None else iou_8 - truth.ceiling,
+        ceiling=truth.ceiling,
+        actions={pose: outline(rollout.actions) for pose, rollout in stored.items()},
+        touches={
+            pose: hashlib.sha256(rollout.touched_step.tobytes()).hexdigest()
+            for pose, rollout in stored.items()
+            if rollout.touched.sum() >= FEWEST_TOUCHES
+        },
+        shape="" if reconstruction is None else _hash(reconstruction),
+    )
+    return score, evidence
+
+
+def _hash(shape: Reconstruction) -> str:
+    """Of its values, whatever file they lie in."""
+    arrays = [shape.probability] if isinstance(shape, Volume) else [shape.vertices, shape.faces]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def score_reconstruction(

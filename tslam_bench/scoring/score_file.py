@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from tslam_bench.version import __version__
 
 SCORE_VERSION: Final = 3
 """Version of the score file's layout."""
+Tier = Literal["reported", "replayed", "attested", "hidden"]
+TIERS: Final = get_args(Tier)
+"""How far an entry was checked (protocol section 12), the least first."""
 COUNTS: Final = ("1", "2", "4", "8")
 """Numbers of poses that are scored."""
 CURVE_SPACING: Final = 10
@@ -64,7 +67,7 @@ class SubmissionScore:
         aggregate: ``"areas"`` and ``"1"``, ``"2"``, ``"4"``, ``"8"`` (poses) -> metric -> estimate over objects and seeds;
             without the metrics that some result lacks.
         notes: one line each: what a reader of the figures should know.
-        verified: whether its rollouts were replayed and reproduced.
+        tier: how far it was checked.
         own_run: whether the explorer is what it calls itself: its rollouts were made by it on this machine.
         made_here: whether these figures were computed by this user on this machine, and not by whoever sent them.
     """
@@ -76,9 +79,14 @@ class SubmissionScore:
     results: tuple[ObjectScore, ...]
     aggregate: dict[str, dict[str, Estimate]]
     notes: tuple[str, ...]
-    verified: bool = False
+    tier: Tier = "reported"
     own_run: bool = False
     made_here: bool = True
+
+    @property
+    def verified(self) -> bool:
+        """Whether touches and exploration figures are those of a replay."""
+        return self.tier != "reported"
 
     def matrix(self, group: str, metric: str) -> NDArray[np.float64]:
         """Values of one metric: (objects, seeds). ``group`` is a key of ``aggregate``."""
@@ -94,6 +102,7 @@ class SubmissionScore:
             "submission": self.info.to_json(),
             "content_hash": self.content_hash,
             "verified": self.verified,
+            "tier": self.tier,
             "own_run": self.own_run,
             "objects": list(self.objects),
             "asset_sha256": self.asset_sha256,

@@ -17,7 +17,7 @@ from typing import Any, Final
 from tslam_bench.errors import AssetError
 from tslam_bench.objects.splits import object_set, resolve_name
 from tslam_bench.objects.store import asset_sha256
-from tslam_bench.scoring.flags import copy_flags, unfelt_flags
+from tslam_bench.scoring.flags import Evidence, flags
 from tslam_bench.scoring.measure import load_truth, score_seeds
 from tslam_bench.scoring.origin import has_origin
 from tslam_bench.scoring.score_file import ObjectScore, SubmissionScore, aggregate
@@ -102,6 +102,7 @@ def score_submission(
     on_progress: Callable[[int, int], None] | None = None,
     cache: Path | None = None,
     record: VerificationRecord | None = None,
+    split: str = "test",
 ) -> SubmissionScore:
     """Scores a submission against the prepared objects of the asset cache.
 
@@ -112,6 +113,7 @@ def score_submission(
         on_progress: called with (done, all) objects.
         cache: asset cache; by default the user's.
         record: what a replay of its rollouts found; by default the record beside the submission, if there is one to be trusted.
+        split: of its objects; one that was read has its own.
 
     Raises:
         InvalidInputError: the submission is refused or has changed since it was read, an object is unknown, or ``record`` is of
@@ -119,8 +121,10 @@ def score_submission(
         AssetError: an object is not prepared.
     """
     if not isinstance(submission, Submission):
-        submission = read_submission(submission)
-    names = tuple(dict.fromkeys(resolve_name(name) for name in (objects or object_set(submission.info.object_set))))
+        submission = read_submission(submission, split=split)
+    split = submission.split
+    asked = objects or object_set(submission.info.object_set, cache)
+    names = tuple(dict.fromkeys(resolve_name(name, split, cache) for name in asked))
     if record is None:
         record, remark = find_record(submission, names, cache)
     else:
@@ -129,31 +133,38 @@ def score_submission(
     parts = [submission.of_object(name) for name in names]
     records = [record and record.of_object(name) for name in names]
     results: list[ObjectScore] = []
-    right: list[float | None] = []
+    evidence: list[Evidence] = []
     scored = (pool.map if pool else map)(_score_part, parts, names, records, [cache] * len(names))
     for done, scores in enumerate(scored, start=1):
         results += [score for score, _ in scores]
-        right += [share for _, share in scores]
+        evidence += [facts for _, facts in scores]
         if on_progress:
             on_progress(done, len(names))
-    flags = [] if submission.info.privileged else [*copy_flags(submission, results), *unfelt_flags(right)]
+    raised = [] if submission.info.privileged else flags(results, evidence)
     return SubmissionScore(
         info=submission.info,
         content_hash=submission.content_hash,
         objects=names,
-        asset_sha256=asset_sha256(names, cache=cache),
+        asset_sha256=asset_sha256(names, split, cache),
         results=tuple(results),
         aggregate=aggregate(results, len(names)),
-        notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record), *flags),
-        verified=record is not None,
-        own_run=has_origin(submission),
+        notes=(*([remark] if remark else []), *_notes(submission, results, names, cache, record), *raised),
+        tier="reported" if record is None else record.tier,
+        own_run=has_origin(submission) or _attested_explorer(submission, record),
     )
+
+
+def _attested_explorer(submission: Submission, record: VerificationRecord | None) -> bool:
+    """Whether the policy of the explorer's name was run and gave these actions."""
+    if record is None or record.attestation is None or record.tier == "replayed":
+        return False
+    return record.attestation.policy.get("policy") == submission.info.explorer
 
 
 def _score_part(
     part: Submission, name: str, record: VerificationRecord | None, cache: Path | None
-) -> list[tuple[ObjectScore, float | None]]:
-    return score_seeds(part, load_truth(name, cache), record)
+) -> list[tuple[ObjectScore, Evidence]]:
+    return score_seeds(part, load_truth(name, cache, part.split), record)
 
 
 def _notes(
@@ -164,9 +175,12 @@ def _notes(
     record: VerificationRecord | None,
 ) -> tuple[str, ...]:
     notes = [] if record is None else [record.summary()]
-    if tuple(names) != object_set(submission.info.object_set):
+    if record is not None and record.attestation is not None:
+        notes += [record.attestation.summary(), *record.attestation.flags()]
+    split, whole = submission.split, object_set(submission.info.object_set, cache)
+    if tuple(names) != whole:
         notes.append(f"scored on chosen objects ({len(names)}), not on the object set {submission.info.object_set!r}")
-    if submission.info.object_set == "test" and len(submission.info.seeds) < FULL_ENTRY_SEEDS:
+    if submission.info.object_set != "quick" and len(submission.info.seeds) < FULL_ENTRY_SEEDS:
         notes.append(f"not a full entry: {len(submission.info.seeds)} of at least {FULL_ENTRY_SEEDS} seeds")
     empty: dict[str, list[str]] = {}
     for result in results:
@@ -183,9 +197,9 @@ def _notes(
         more = f" and {len(places) - 3} more" if len(places) > 3 else ""
         notes.append(f"counted as empty, {reason}: {'; '.join(places[:3])}{more}")
     # A submission hashes the objects it holds: the whole set, or the chosen ones.
-    hashes = [asset_sha256(names, cache=cache)]
+    hashes = [asset_sha256(names, split, cache)]
     with contextlib.suppress(AssetError):
-        hashes.append(asset_sha256(object_set(submission.info.object_set), cache=cache))
+        hashes.append(asset_sha256(whole, split, cache))
     if submission.info.asset_manifest_sha256 not in hashes:
         notes.append("the rollouts were made with other assets, or of other objects, than the ones scored against")
     return tuple(notes)

@@ -27,9 +27,9 @@ from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import atomic_file, ensure_writable_directory, link_or_copy, write_json
 from tslam_bench.geometry.ply import MAX_MESH_ELEMENTS, read_ply
-from tslam_bench.objects.splits import ALIASES, OBJECTS
+from tslam_bench.objects.splits import ALIASES, check_split, known_names
 from tslam_bench.reconstruction.volume import Volume
-from tslam_bench.scoring.info import SubmissionInfo, parse_info
+from tslam_bench.scoring.info import OBJECT_SETS, SubmissionInfo, parse_info
 from tslam_bench.scoring.rollout import OBJECT_NAME, Rollout, parse_rollout_file, rollout_file
 from tslam_bench.scoring.untrusted_arrays import Expected, read_npz
 from tslam_bench.scoring.untrusted_files import FileSource, open_source
@@ -68,13 +68,22 @@ class Submission:
         info: contents of ``submission.json``.
         location: the path it was read from.
         content_hash: SHA-256 over the names and bytes of all its files; the same for a folder and a zip of it.
+        split: of its objects.
     """
 
-    def __init__(self, source: FileSource, info: SubmissionInfo, digests: Mapping[str, str], content_hash: str) -> None:
+    def __init__(
+        self,
+        source: FileSource,
+        info: SubmissionInfo,
+        digests: Mapping[str, str],
+        content_hash: str,
+        split: str = "test",
+    ) -> None:
         """Args: digests: name -> SHA-256 of each of the files that were checked."""
         self.info = info
         self.location = source.location
         self.content_hash = content_hash
+        self.split = split
         self._source = source
         self._digests = digests
 
@@ -89,7 +98,7 @@ class Submission:
     def of_object(self, object_name: str) -> Submission:
         """The same submission with the files of one object only: less to send to another process."""
         own = {name: digest for name, digest in self._digests.items() if _object_of(name) == object_name}
-        return Submission(self._source.only(own), self.info, own, self.content_hash)
+        return Submission(self._source.only(own), self.info, own, self.content_hash, self.split)
 
     def rollout(self, object_name: str, pose: int, seed: int) -> Rollout | None:
         """One episode, or None if the submission does not hold it."""
@@ -123,16 +132,18 @@ class Submission:
         return data
 
 
-def read_submission(path: Path | str, objects: Collection[str] | None = None) -> Submission:
+def read_submission(path: Path | str, objects: Collection[str] | None = None, split: str = "test") -> Submission:
     """Reads, hashes and checks every file of a submission, folder or zip archive, without trusting it.
 
     Args:
         path: folder or zip archive.
-        objects: names that may occur; the test split by default.
+        objects: names that may occur; those of the split by default.
+        split: that the submission is of.
 
     Raises:
         InvalidInputError: one line that names the submission, the file in it, what is wrong and the remedy.
     """
+    split = check_split(split)
     source = open_source(Path(path))
     if INFO_FILE not in source.sizes:
         raise InvalidInputError(f"{source.location}: {INFO_FILE} is missing; {_where_else(source)}")
@@ -143,7 +154,12 @@ def read_submission(path: Path | str, objects: Collection[str] | None = None) ->
         info = parse_info(data)
     except InvalidInputError as error:
         raise InvalidInputError(f"{source.location}: {INFO_FILE}: {error}") from error
-    _check_names(source, info, OBJECTS.keys() if objects is None else objects)
+    if info.split != split:
+        raise InvalidInputError(
+            f"{source.location}: {INFO_FILE}: object_set {info.object_set!r} is not of split {split!r}; choose one of "
+            f"{', '.join(OBJECT_SETS) if split == 'test' else split}, or say --split {info.split}"
+        )
+    _check_names(source, info, known_names(split) if objects is None else objects)
     digests = {INFO_FILE: hashlib.sha256(data).hexdigest()}
     for name in source.sizes:
         if name != INFO_FILE:
@@ -153,7 +169,7 @@ def read_submission(path: Path | str, objects: Collection[str] | None = None) ->
                 Rollout.from_bytes(data, episode, f"{source.location}: {name}")
             else:
                 _reconstruction(data, name, source.location)
-    return Submission(source, info, digests, _combined(digests))
+    return Submission(source, info, digests, _combined(digests), split)
 
 
 def _where_else(source: FileSource) -> str:

@@ -22,10 +22,12 @@ from tslam_bench.objects.splits import OBJECTS
 from tslam_bench.scoring.aggregate import Estimate
 from tslam_bench.scoring.info import SubmissionInfo, check_info
 from tslam_bench.scoring.measure import CALIBRATION_METRICS, SHAPE_METRICS, TOUCH_METRICS
+from tslam_bench.scoring.rollout import OBJECT_NAME
 from tslam_bench.scoring.score_file import (
     COUNTS,
     CURVE_SPACING,
     SCORE_VERSION,
+    TIERS,
     ObjectScore,
     SubmissionScore,
     aggregate,
@@ -36,6 +38,8 @@ from tslam_bench.scoring.untrusted_json import parse_json
 
 MAX_SCORE_SIZE: Final = 64 * 2**20
 """Bytes of a score file; one of 50 objects and 100 seeds has 45 MB."""
+MAX_OBJECTS: Final = 1000
+"""Of an organiser's own split."""
 MAX_NOTES: Final = 20_000
 MAX_NOTE: Final = 4000
 """Characters of a note."""
@@ -125,11 +129,12 @@ def _score(value: Any, vouched: bool) -> SubmissionScore:
     claimed = value.get("seal")
     content = {name: field for name, field in value.items() if name != "seal"}
     made_here = vouched or (claimed is not None and sealed_here(content, claimed))
+    content.setdefault("tier", "replayed" if content.get("verified") is True else "reported")  # older files have none
     _keys(
         content,
         "the file",
         *("score_version", "protocol_version", "package_version", "submission", "content_hash", "verified"),
-        "own_run",
+        *("tier", "own_run"),
         *("objects", "asset_sha256", "results", "aggregate", "notes"),
     )
     _text(content["package_version"], "package_version", 100)
@@ -140,9 +145,13 @@ def _score(value: Any, vouched: bool) -> SubmissionScore:
     for name in ("verified", "own_run"):
         if not isinstance(content[name], bool):
             raise _Wrong(f"{name} is neither true nor false")
-    objects = tuple(_text(name, "objects", 80) for name in _list(content["objects"], "objects", len(OBJECTS)))
-    if not objects or len(set(objects)) < len(objects) or not OBJECTS.keys() >= set(objects):
-        raise _Wrong("objects are not different objects of the test split")
+    if content["tier"] not in TIERS:
+        raise _Wrong(f"tier is none of {', '.join(TIERS)}")
+    most = len(OBJECTS) if info.split == "test" else MAX_OBJECTS
+    objects = tuple(_text(name, "objects", 80) for name in _list(content["objects"], "objects", most))
+    known = OBJECTS if info.split == "test" else [name for name in objects if re.fullmatch(OBJECT_NAME, name)]
+    if not objects or len(set(objects)) < len(objects) or not set(objects) <= set(known):
+        raise _Wrong(f"objects are not different objects of the {info.split} split")
     episodes = [(name, seed) for name in objects for seed in info.seeds]
     results = _list(content["results"], "results", len(episodes))
     if len(results) != len(episodes):
@@ -159,7 +168,7 @@ def _score(value: Any, vouched: bool) -> SubmissionScore:
         results=scores,
         aggregate=_estimates(content["aggregate"]) if made_here else aggregate(scores, len(objects)),
         notes=tuple(notes) if made_here else (NOT_MADE_HERE, *(note for note in notes if note != NOT_MADE_HERE)),
-        verified=content["verified"] and made_here,
+        tier=content["tier"] if made_here else TIERS[0],
         own_run=content["own_run"] and made_here,
         made_here=made_here,
     )

@@ -23,9 +23,12 @@ from tslam_bench.constants import GRID_SIZE, HORIZON, PROTOCOL_VERSION
 from tslam_bench.episodes import Episode
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.files import read_plain_file, write_json
+from tslam_bench.objects.splits import SPLITS
 from tslam_bench.objects.store import asset_sha256
+from tslam_bench.scoring.attestation import Attestation
 from tslam_bench.scoring.origin import beside
 from tslam_bench.scoring.rollout import Rollout
+from tslam_bench.scoring.score_file import Tier
 from tslam_bench.scoring.seal import seal, sealed_here
 from tslam_bench.scoring.submission import Submission
 
@@ -96,6 +99,8 @@ class VerificationRecord:
         tolerances: those of ``segments``, by name.
         package_version, processor, simulator: what replayed.
         verdicts: one for each rollout of each object in ``assets``.
+        split: of the objects.
+        attestation: what running the submission's own code gave, if that was done.
     """
 
     content_hash: str
@@ -106,6 +111,15 @@ class VerificationRecord:
     processor: str
     simulator: str
     verdicts: tuple[Verdict, ...]
+    split: str = "test"
+    attestation: Attestation | None = None
+
+    @property
+    def tier(self) -> Tier:
+        """How far the submission was checked."""
+        if self.attestation is None or self.departed or self.attestation.failures():
+            return "replayed"
+        return "attested" if self.split in SPLITS else "hidden"
 
     @property
     def departed(self) -> tuple[Verdict, ...]:
@@ -114,7 +128,7 @@ class VerificationRecord:
 
     def same_replay(self, other: VerificationRecord) -> bool:
         """Whether both are of one submission, replayed in one way on one machine: then one can go on where the other stopped."""
-        return dataclasses.replace(self, assets={}, verdicts=()) == dataclasses.replace(other, assets={}, verdicts=())
+        return _bare(self) == _bare(other)
 
     def of_object(self, name: str) -> VerificationRecord:
         """The same record with one object's verdicts only."""
@@ -146,11 +160,13 @@ class VerificationRecord:
         """Raises InvalidInputError unless this is a record of these files, these assets, and all rollouts of ``objects``."""
         if self.content_hash != submission.content_hash:
             raise InvalidInputError(f"{where}: made for other files than {submission.location} holds; run verify again")
+        if self.split != submission.split:
+            raise InvalidInputError(f"{where}: made on split {self.split}, not {submission.split}; run verify again")
         for name in objects:
             wanted = {episode for episode in submission.episodes() if episode[0] == name}
             if wanted and name not in self.assets:
                 raise InvalidInputError(f"{where}: {name} is not replayed yet; run verify again to go on")
-            if wanted and self.assets[name] != asset_sha256([name], cache=cache):
+            if wanted and self.assets[name] != asset_sha256([name], self.split, cache):
                 raise InvalidInputError(
                     f"{where}: {name} was replayed on other assets than are prepared here; run verify again"
                 )
@@ -178,12 +194,21 @@ class VerificationRecord:
             if not sealed_here(content, claimed):
                 raise InvalidInputError(f"{path}: not made here, or changed since; {remedy}")
             fields = {k: v for k, v in content.items() if k not in ("record_version", "protocol_version", "verdicts")}
-            return VerificationRecord(**fields, verdicts=tuple(Verdict(**v) for v in content["verdicts"]))
+            attestation = fields.pop("attestation", None)
+            return VerificationRecord(
+                **fields,
+                verdicts=tuple(Verdict(**v) for v in content["verdicts"]),
+                attestation=attestation and Attestation(**attestation),
+            )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             if isinstance(error, InvalidInputError):
                 raise
             reason = " ".join(str(error).split())[:100]
             raise InvalidInputError(f"{path}: not a verification record ({reason}); {remedy}") from error
+
+
+def _bare(record: VerificationRecord) -> VerificationRecord:
+    return dataclasses.replace(record, assets={}, verdicts=(), attestation=None)
 
 
 def record_path(submission: Path | str) -> Path:

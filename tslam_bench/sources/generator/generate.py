@@ -28,14 +28,17 @@ ATTEMPTS = 30
 """Draws until one passes the gate."""
 
 
-def _generator(category: str, index: int, attempt: int) -> np.random.Generator:
+def _generator(category: str, index: int, attempt: int, seed: int) -> np.random.Generator:
     """The random stream of one draw."""
-    key = [GENERATOR_SEED, zlib.crc32(category.encode()), index, attempt]
+    key = [seed, zlib.crc32(category.encode()), index, attempt]
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
-def draw(category: str, index: int) -> tuple[TriangleMesh, dict[str, Any]]:
+def draw(category: str, index: int, seed: int = GENERATOR_SEED) -> tuple[TriangleMesh, dict[str, Any]]:
     """Draws shape number ``index`` of a category.
+
+    Args:
+        seed: not negative, of any size; another one gives other shapes.
 
     Returns:
         the mesh (m, z up, centred on its bounding box; longest edge in the category's range) and the facts of the draw.
@@ -49,7 +52,7 @@ def draw(category: str, index: int) -> tuple[TriangleMesh, dict[str, Any]]:
     kind = CATEGORIES[category]
     reason = "nothing drawn"
     for attempt in range(ATTEMPTS):
-        generator = _generator(category, index, attempt)
+        generator = _generator(category, index, attempt, seed)
         solid, genus = kind.make(generator)
         size = float(generator.uniform(*kind.size))
         if not is_valid(solid):
@@ -96,9 +99,14 @@ class GeneratedSource:
             mesh=mesh,
             source=f"generated (generator version {GENERATOR_VERSION}, seed {GENERATOR_SEED})",
             license="Apache-2.0",
-            sha256=hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest(),
+            sha256=mesh_sha256(mesh),
             details=details,
         )
+
+
+def mesh_sha256(mesh: TriangleMesh) -> str:
+    """Hash of a mesh that no file holds."""
+    return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
 
 
 def candidates(split: str, start: int = 0, rounds: int = 1_000) -> list[GeneratedSource]:

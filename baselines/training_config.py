@@ -42,7 +42,7 @@ class TrainingConfig:
     """Policy network; fast: matrix products for a CPU; hand: the same, and again around the hand; paper: six 3D convolutions."""
     clock: int = 5
     """Sine and cosine pairs of the time among the network's inputs, turning once, twice, 4, 8, ... times per episode."""
-    initial_std: float = 1.0
+    initial_std: float = 0.6
     """Standard deviation of the untrained policy in fingers, wrist and roll; an action of 1 is a joint's limit."""
     initial_arm_std: float = 0.3
     """The same of the arm's three translations."""
@@ -66,11 +66,11 @@ class TrainingConfig:
     """Adam's step size."""
     final_learning_rate: float = 1.0
     """Share of the step size that is left at the end, reached linearly."""
-    std_learning_rate: float = 1.0
+    std_learning_rate: float = 10.0
     """Factor on the step size of the standard deviations that depend on the joint alone."""
-    gamma: float = 0.97
-    """Discount per decision; 0.97 per 4 control steps is 0.992 per control step (paper: 0.99)."""
-    gae_lambda: float = 0.95
+    gamma: float = 0.9
+    """Discount per decision; 0.9 per 4 control steps is 0.974 per control step (paper: 0.99)."""
+    gae_lambda: float = 0.8
     """Decay of generalised advantage estimation."""
     clip_range: float = 0.2
     """PPO's clip of the probability ratio."""

@@ -119,6 +119,9 @@ START: Final[dict[str, Any]] = {
     "initial_aim": (0.0, 0.0, 0.0),
     "initial_std": 0.6,
     "initial_arm_std": 0.6,
+    "std_learning_rate": 1.0,
+    "gamma": 0.97,
+    "gae_lambda": 0.95,
     "clock": 0,
 }
 """The recipe that the search began with."""

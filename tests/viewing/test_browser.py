@@ -29,7 +29,7 @@ from tslam_bench.viewing.site import write_viewer
 from tslam_bench.viewing.surface import net
 
 READY = "main[aria-busy=false]"
-SMALL = (700, 420)
+SMALL = (640, 400)
 """Window of most tests: software draws it quickly."""
 
 
@@ -89,7 +89,7 @@ def shown(page: Any) -> np.ndarray:
 
 def test_nothing_sticks_out_and_something_is_drawn(opened: Any) -> None:
     page = opened("#view=episode&pose=0&step=100")
-    for width, height in ((1400, 700), (900, 600), (390, 640)):
+    for width, height in ((1400, 480), (900, 440), (390, 480)):
         page.set_viewport_size({"width": width, "height": height})
         for view in ("episode", "shape"):
             page.click(f"button[data-view={view}]")

@@ -119,10 +119,11 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert "a reference has no policy" in refused(capsys, "--policy", "oracle", *output)
 
 
-def test_a_policy_explores_now(tmp_path: Path) -> None:
+def test_a_policy_explores_now_objects_of_any_split(tmp_path: Path) -> None:
     output = tmp_path / "live"
-    main(["view", "--policy", "random_targets", "--pose", "7", "--output", str(output), "--no-browser"])
-    (pose,) = header(output, "episodes")["poses"]
+    chosen = ["--object", "mug-000", "--split", "train", "--policy", "random_targets", "--pose", "7"]
+    main(["view", *chosen, "--output", str(output), "--no-browser"])
+    (pose,) = header(output, "episodes", "mug-000")["poses"]
     assert (pose["pose"], pose["source"]) == (7, "live")
-    assert listed(output)["hand"] == "data/hand.js" and listed(output)["title"] == "random_targets feels mug"
+    assert listed(output)["hand"] == "data/hand.js" and listed(output)["title"] == "random_targets feels mug-000"
     assert 0 < sum(path.stat().st_size for path in output.rglob("*") if path.is_file()) < 1.5e6

@@ -142,23 +142,25 @@ def _stored(parsed: View) -> tuple[list[Entry], MotionSource]:
                     f"{path}: a second episode of {rollout.object} in pose {rollout.pose}; give one"
                 )
             continue
-        entries += [submission_entry(each, names, parsed.pose, parsed.seed) for each in _submissions(path)]
+        entries += [
+            submission_entry(each, names, parsed.pose, parsed.seed) for each in _submissions(path, parsed.split)
+        ]
     if explored:
         made = {name: chosen.made for name, chosen in make_reconstructors(parsed.reconstructor).items()}
         entries += _entries("rollout file", explored, made, "", parsed)
     return entries, _replays(parsed)
 
 
-def _submissions(path: Path) -> list[Submission]:
+def _submissions(path: Path, split: str) -> list[Submission]:
     """The submission that a path is, or those of a run's folder."""
     if not path.is_dir() or (path / INFO_FILE).is_file():
-        return [read_submission(path)]
+        return [read_submission(path, split=split)]
     found = [f.parent for where in (path, path / "submissions") for f in sorted(where.glob(f"*/{INFO_FILE}"))]
     if not found:
         raise InvalidInputError(
             f"{path}: holds no submission ({INFO_FILE} is missing) and is no rollout file; check the path"
         )
-    return [read_submission(folder) for folder in found]
+    return [read_submission(folder, split=split) for folder in found]
 
 
 def _entries(

@@ -90,12 +90,25 @@ def test_rollout_files_are_completed_here(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("cached")
+def test_all_submissions_of_a_run_are_compared(run: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    main(["view", str(run), "--object", "mug", "--pose", "0", "--no-replay", "--output", str(output), "--no-browser"])
+    entries = [(e["explorer"], e["reconstructor"], e["remark"]) for e in listed(output)["entries"]]
+    assert entries == [
+        ("heuristic", "hull", ""),
+        ("mine", "hull", '"><script>alert(1)</script>'),
+        ("random", "grid", ""),
+        ("tslam_chamfer", "hull", "privileged"),
+    ]
+
+
+@pytest.mark.usefixtures("cached")
 def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     rollout = str(run / "submissions" / "heuristic-hull" / "rollouts" / "mug" / "pose0_seed0.npz")
     other = str(run / "submissions" / "random-grid" / "rollouts" / "mug" / "pose0_seed0.npz")
     output = ["--output", str(tmp_path / "out"), "--no-browser"]
     assert "no such" in refused(capsys, str(tmp_path / "nothing"), *output)
-    assert "submission.json is missing" in refused(capsys, str(run), *output)
+    assert "submission.json is missing" in refused(capsys, str(run / "scores"), *output)
     assert "a second episode of mug in pose 0; give one" in refused(capsys, rollout, other, "--no-replay", *output)
     assert "pose 8" in refused(capsys, "--pose", "8", *output)
     assert "unknown" in refused(capsys, "--object", "mugg", *output)
@@ -106,10 +119,11 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert "a reference has no policy" in refused(capsys, "--policy", "oracle", *output)
 
 
-def test_a_policy_explores_now(tmp_path: Path) -> None:
+def test_a_policy_explores_now_objects_of_any_split(tmp_path: Path) -> None:
     output = tmp_path / "live"
-    main(["view", "--policy", "random_targets", "--pose", "7", "--output", str(output), "--no-browser"])
-    (pose,) = header(output, "episodes")["poses"]
+    chosen = ["--object", "mug-000", "--split", "train", "--policy", "random_targets", "--pose", "7"]
+    main(["view", *chosen, "--output", str(output), "--no-browser"])
+    (pose,) = header(output, "episodes", "mug-000")["poses"]
     assert (pose["pose"], pose["source"]) == (7, "live")
-    assert listed(output)["hand"] == "data/hand.js" and listed(output)["title"] == "random_targets feels mug"
+    assert listed(output)["hand"] == "data/hand.js" and listed(output)["title"] == "random_targets feels mug-000"
     assert 0 < sum(path.stat().st_size for path in output.rglob("*") if path.is_file()) < 1.5e6

@@ -42,7 +42,7 @@ class View:
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Rollout files (.npz) of one object, or submissions (folders or zip archives); none: a policy explores now."""
+    """Rollout files (.npz), submissions (folders or zip archives) or runs that hold some; none: a policy explores now."""
     object: tuple[str, ...] = ()
     """Objects; default: mug if a policy explores, all objects of a submission."""
     pose: tuple[int, ...] = ()
@@ -142,20 +142,25 @@ def _stored(parsed: View) -> tuple[list[Entry], MotionSource]:
                     f"{path}: a second episode of {rollout.object} in pose {rollout.pose}; give one"
                 )
             continue
-        submission = _submission(path)
-        entries.append(submission_entry(submission, names, parsed.pose, parsed.seed))
+        entries += [
+            submission_entry(each, names, parsed.pose, parsed.seed) for each in _submissions(path, parsed.split)
+        ]
     if explored:
         made = {name: chosen.made for name, chosen in make_reconstructors(parsed.reconstructor).items()}
         entries += _entries("rollout file", explored, made, "", parsed)
     return entries, _replays(parsed)
 
 
-def _submission(path: Path) -> Submission:
-    if path.is_dir() and not (path / INFO_FILE).is_file():
+def _submissions(path: Path, split: str) -> list[Submission]:
+    """The submission that a path is, or those of a run's folder."""
+    if not path.is_dir() or (path / INFO_FILE).is_file():
+        return [read_submission(path, split=split)]
+    found = [f.parent for where in (path, path / "submissions") for f in sorted(where.glob(f"*/{INFO_FILE}"))]
+    if not found:
         raise InvalidInputError(
-            f"{path}: no submission ({INFO_FILE} is missing); give one of its subfolders, or a rollout file"
+            f"{path}: holds no submission ({INFO_FILE} is missing) and is no rollout file; check the path"
         )
-    return read_submission(path)
+    return [read_submission(folder, split=split) for folder in found]
 
 
 def _entries(

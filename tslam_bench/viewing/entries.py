@@ -90,7 +90,7 @@ def submission_entry(
         rollouts = {pose: rollout for pose, rollout in found.items() if rollout is not None}
         played = tuple(pose for pose in rollouts if not poses or pose in poses)
         shapes = {count: submission.reconstruction(name, count, seed) for count in COUNTS}
-        return Explored(name, "test", about.control_mode, rollouts, played, RECONSTRUCTED_POSES, shapes)
+        return Explored(name, submission.split, about.control_mode, rollouts, played, RECONSTRUCTED_POSES, shapes)
 
     def episodes(name: str) -> str:
         digest = submission.rollouts_hash(name, seed)

@@ -16,6 +16,7 @@
       this.camera.up.set(0, 0, 1);
       this.controls = new THREE.OrbitControls(this.camera, element);
       this.controls.enablePan = false;
+      element.style.touchAction = "pan-y"; // a finger that goes up or down scrolls the page, else it turns the model
       this.controls.rotateSpeed = 0.8;
       this.controls.minDistance = 0.08;
       this.controls.maxDistance = 3;

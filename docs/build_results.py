@@ -25,7 +25,7 @@ from tslam_bench.files import atomic_file
 from tslam_bench.leaderboard.commands import find_inputs, page_texts, plan_pictures
 from tslam_bench.leaderboard.pictures import make_pictures
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.shown import PICTURES, Key, read_links, read_pictures, write_pictures
+from tslam_bench.leaderboard.shown import PICTURES, Key, read_pictures, write_pictures
 from tslam_bench.leaderboard.training import find_records, read_records
 from tslam_bench.scoring.figures import (
     EXPLORATION_AREA,
@@ -194,7 +194,8 @@ def main(config: Config) -> None:
             keep(config, config.run)
         board = kept_board()
         pages = {page: filled(page, texts) for page, texts in texts_of(board).items()}
-        site = page_texts(board, read_pictures(SITE / PICTURES), read_links(SITE)) if board["tables"] else {}
+        # Without the viewer: its data hold the true meshes and the hand, which this repository does not contain.
+        site = page_texts(board, read_pictures(SITE / PICTURES), links={}) if board["tables"] else {}
         write_or_check(pages | {SITE / name: text for name, text in site.items()}, config.check)
 
 

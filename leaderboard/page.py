@@ -229,7 +229,8 @@ def _gallery_object(
     best = max(ranked or entries, key=lambda entry: _iou_at_8(entry, name))
     rows = []
     for explorer in explorers:
-        links = (viewer.get((entry["content_hash"], name), "") for entry in explorer.entries)
+        played = explorer.entries if explorer.curve else ()  # a reference has no episodes
+        links = (viewer.get((entry["content_hash"], name), "") for entry in played)
         touched = (pictures.get(("touched", entry["content_hash"], name)) for entry in explorer.entries)
         cells: dict[str, list[dict[str, Any]]] = {r: [] for r in reconstructors if r != TOUCHED_AS_THEY_ARE}
         for entry in explorer.entries:

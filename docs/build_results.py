@@ -194,7 +194,8 @@ def main(config: Config) -> None:
             keep(config, config.run)
         board = kept_board()
         pages = {page: filled(page, texts) for page, texts in texts_of(board).items()}
-        site = page_texts(board, read_pictures(SITE / PICTURES), SITE) if board["tables"] else {}
+        # Without the viewer: its data hold the true meshes and the hand, which this repository does not contain.
+        site = page_texts(board, read_pictures(SITE / PICTURES), links={}) if board["tables"] else {}
         write_or_check(pages | {SITE / name: text for name, text in site.items()}, config.check)
 
 

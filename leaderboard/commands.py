@@ -26,13 +26,12 @@ from tslam_bench.scoring.verification import find_record
 from .page import build_page
 from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_picture
 from .ranking import rank
-from .shown import PICTURES, Key, Shown, write_pictures
+from .shown import PICTURES, Key, Links, Shown, read_links, write_links, write_pictures
 from .training import find_records, read_records
+from .viewer import write_entries_viewer
 
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"
-VIEWER_FILE: Final = "viewer.html"
-"""Beside a page, it shows objects of entries in 3D."""
 PICTURE_FOLDER: Final = ".pictures"
 """Everything that was drawn for this folder; the page shows what lies in ``PICTURES``."""
 
@@ -60,6 +59,9 @@ class LeaderboardArguments:
     """Split that the submissions are of; pictures are drawn of the test split."""
     pictured: int = 12
     """Objects in the gallery, the quick ones first; 0 leaves the gallery out."""
+    viewer: int = 0
+    """Objects that can be turned in 3D and whose episodes can be played, the quick ones first; each takes about a second for
+    every entry and every explorer. Their page lies in the subfolder viewer/."""
     workers: int = 1
     """Processes that score and draw."""
     json: bool = False
@@ -110,6 +112,10 @@ def page_main(arguments: Sequence[str]) -> None:
             list(dict.fromkeys(pictures.values())), parsed.output / PICTURE_FOLDER, parsed.workers, bar.show
         )
     images = {key: drawn[picture] for key, picture in pictures.items() if picture in drawn}
+    if parsed.viewer > 0 and submissions and parsed.split == "test":
+        turned = {name for table in leaderboard["tables"] for name in first_objects(table, parsed.viewer)}
+        with Progress("viewer", "object", leave=False) as bar:
+            write_links(write_entries_viewer(parsed.output, submissions, turned, on_progress=bar.show), parsed.output)
     size = write_page(leaderboard, write_pictures(images, parsed.output / PICTURES), parsed.output)
     if parsed.json:
         print(json.dumps(leaderboard, indent=2, sort_keys=True))
@@ -121,21 +127,15 @@ def page_main(arguments: Sequence[str]) -> None:
     batch.finish("the page shows the others")
 
 
-def page_texts(leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], folder: Path) -> dict[str, str]:
-    """File name -> text of a page in ``folder``: the page, which names the viewer if that lies there, and its data."""
-    viewer = {
-        (entry["content_hash"], name)
-        for table in (leaderboard["tables"] if (folder / VIEWER_FILE).is_file() else ())
-        for entry in table["entries"]
-        for name in table["objects"]
-    }
+def page_texts(leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], links: Links) -> dict[str, str]:
+    """File name -> text: the page and its data."""
     data = json.dumps(leaderboard, sort_keys=True, allow_nan=False, separators=(",", ":"))
-    return {PAGE_FILE: build_page(leaderboard, pictures, viewer), DATA_FILE: data + "\n"}
+    return {PAGE_FILE: build_page(leaderboard, pictures, links), DATA_FILE: data + "\n"}
 
 
 def write_page(leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], folder: Path) -> int:
-    """Writes a page and its data, the page last; returns its bytes."""
-    texts = page_texts(leaderboard, pictures, folder)
+    """Writes a page, which links to the viewer that lies in ``folder``, and its data, the page last; returns its bytes."""
+    texts = page_texts(leaderboard, pictures, read_links(folder))
     for name in (DATA_FILE, PAGE_FILE):
         with atomic_file(folder / name) as temporary:
             temporary.write_text(texts[name], encoding="utf-8")
@@ -180,6 +180,11 @@ def find_inputs(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     return list(scores), list(submissions)
 
 
+def first_objects(table: Mapping[str, Any], count: int) -> list[str]:
+    """The first objects of a table, the quick ones before others."""
+    return sorted(table["objects"], key=lambda name: (name not in QUICK_OBJECTS, name))[: max(count, 0)]
+
+
 def plan_pictures(
     leaderboard: dict[str, Any], submissions: dict[str, Submission], objects: int
 ) -> dict[tuple[str, str, str], Picture]:
@@ -190,7 +195,7 @@ def plan_pictures(
     """
     pictures: dict[tuple[str, str, str], Picture] = {}
     for table in leaderboard["tables"]:
-        names = sorted(table["objects"], key=lambda name: (name not in QUICK_OBJECTS, name))[:objects]
+        names = first_objects(table, objects)
         for entry in table["entries"]:
             key = entry["content_hash"]
             if key not in submissions:

@@ -12,8 +12,9 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import jinja2
@@ -27,7 +28,7 @@ from tslam_bench.text import visible
 from .chart_data import chart_data
 from .explorers import Explorer, group_explorers
 from .pictures import TOUCHED_AS_THEY_ARE
-from .shown import Key, Shown
+from .shown import Key, Links, Shown
 
 OPEN_OBJECTS: Final = 2
 """Objects of the gallery that are unfolded when the page opens."""
@@ -54,14 +55,14 @@ _SCRIPTS: Final = ("vendor/d3.min.js", "vendor/plot.umd.min.js", "templates/tabl
 
 
 def build_page(
-    leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], viewer: Container[tuple[str, str]] = ()
+    leaderboard: Mapping[str, Any], pictures: Mapping[Key, Shown], viewer: Links = MappingProxyType({})
 ) -> str:
     """The page's HTML.
 
     Args:
         leaderboard: what :func:`tslam_bench.leaderboard.ranking.rank` returned.
         pictures: those beside the page; what is missing is shown as missing.
-        viewer: (content hash, object) of what ``viewer.html`` beside the page can show.
+        viewer: where the viewer beside the page shows shapes; its episodes are a view of the same.
     """
     boards = leaderboard["tables"]
     tables = [_table_view(number, table, leaderboard, pictures, viewer) for number, table in enumerate(boards, start=1)]
@@ -152,7 +153,7 @@ def _table_view(
     table: Mapping[str, Any],
     leaderboard: Mapping[str, Any],
     pictures: Mapping[Key, Shown],
-    viewer: Container[tuple[str, str]],
+    viewer: Links,
 ) -> dict[str, Any]:
     """One ranking with its charts and its gallery."""
     entries = table["entries"]
@@ -221,13 +222,15 @@ def _gallery_object(
     explorers: Sequence[Explorer],
     reconstructors: Sequence[str],
     pictures: Mapping[Key, Shown],
-    viewer: Container[tuple[str, str]],
+    viewer: Links,
 ) -> dict[str, Any]:
     """Pictures of one object: a row for each explorer, with the reconstructions of its touches."""
     ranked = [entry for entry in entries if entry["rank"] is not None]
     best = max(ranked or entries, key=lambda entry: _iou_at_8(entry, name))
     rows = []
     for explorer in explorers:
+        played = explorer.entries if explorer.curve else ()  # a reference has no episodes
+        links = (viewer.get((entry["content_hash"], name), "") for entry in played)
         touched = (pictures.get(("touched", entry["content_hash"], name)) for entry in explorer.entries)
         cells: dict[str, list[dict[str, Any]]] = {r: [] for r in reconstructors if r != TOUCHED_AS_THEY_ARE}
         for entry in explorer.entries:
@@ -236,13 +239,14 @@ def _gallery_object(
                     {
                         "image": pictures.get(("reconstruction", entry["content_hash"], name)),
                         "iou": _iou_at_8(entry, name),
-                        "entry": entry["content_hash"] if (entry["content_hash"], name) in viewer else "",
+                        "link": viewer.get((entry["content_hash"], name), ""),
                     }
                 )
         rows.append(
             {
                 "explorer": explorer,
                 "touched": next((image for image in touched if image is not None), None),
+                "episodes": next((link.replace("view=shape", "view=episode") for link in links if link), ""),
                 "recall": explorer.entries[0]["per_object"][name]["8"]["touched_surface_recall"],
                 "cells": cells,
             }

@@ -20,10 +20,15 @@ PICTURES: Final = "pictures"
 """Folder of the pictures, beside the page."""
 LIST_FILE: Final = "pictures.json"
 """What each picture shows: a page can be built again from it without the submissions."""
+LINKS_FILE: Final = "viewer.json"
+"""Beside the page: which object of which entry its 3D viewer shows, and where."""
 _NAME: Final = re.compile(r"[0-9a-f]{24}\.webp")
 
 Key = tuple[str, str, str]
 """(kind, content hash, object); the hash is empty for the true mesh."""
+
+Links = Mapping[tuple[str, str], str]
+"""(content hash, object) -> address relative to the page."""
 
 
 @dataclass(frozen=True)
@@ -86,3 +91,31 @@ def read_pictures(folder: Path) -> dict[Key, Shown]:
         if not _NAME.fullmatch(picture.file) or not (folder / picture.file).is_file():
             raise InvalidInputError(f"{path}: {picture.file:.60} is not there; build the page again")
     return shown
+
+
+def write_links(links: Links, folder: Path) -> None:
+    """Writes what the viewer beside a page shows."""
+    rows = [
+        {"content_hash": content, "object": name, "address": link} for (content, name), link in sorted(links.items())
+    ]
+    write_json(folder / LINKS_FILE, rows)
+
+
+def read_links(folder: Path) -> dict[tuple[str, str], str]:
+    """What :func:`write_links` wrote, of pages that are still there; empty where there is nothing.
+
+    Raises:
+        InvalidInputError: the list is not one, or leads elsewhere.
+    """
+    path = folder / LINKS_FILE
+    if not path.is_file():
+        return {}
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        links = {(row["content_hash"], row["object"]): str(row["address"]) for row in rows}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InvalidInputError(f"{path}: no list of links ({error!r:.80}); build the page again") from error
+    for link in links.values():
+        if not re.fullmatch(r"viewer/[\w.-]+\.html#\S*", link):
+            raise InvalidInputError(f"{path}: {link[:60]!r} does not lead into the viewer; build the page again")
+    return {key: link for key, link in links.items() if (folder / link.partition("#")[0]).is_file()}

@@ -14,7 +14,6 @@ import zipfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from tslam_bench.errors import AssetError, InvalidInputError
 from tslam_bench.leaderboard.commands import find_inputs, page_main, write_page
 from tslam_bench.leaderboard.page import build_page, row_names
 from tslam_bench.leaderboard.ranking import rank
-from tslam_bench.leaderboard.shown import Shown, read_pictures, write_pictures
+from tslam_bench.leaderboard.shown import Shown, read_links, read_pictures, write_links, write_pictures
 from tslam_bench.objects.store import asset_sha256
 from tslam_bench.scoring.origin import beside, has_origin, write_origin
 from tslam_bench.scoring.submission import read_submission
@@ -123,7 +122,9 @@ def page_with(text: str, link: str) -> str:
     table = board["tables"][0]
     table["objects"] = [name + text for name in table["objects"]]
     images = {("truth", "", name): Shown("a.webp", 2, 1) for name in table["objects"]}
-    viewer = {(entry["content_hash"], name) for entry in table["entries"] for name in table["objects"]}
+    viewer = {
+        (e["content_hash"], name): f"viewer/index.html#{text}" for e in table["entries"] for name in table["objects"]
+    }
     for number, entry in enumerate(table["entries"]):
         names = {"explorer": f"{number}{text}", "reconstructor": text, "method": text, "label": text, "link": link}
         entry["submission"] |= {**names, "authors": [text, text], "contact": text, "package_version": text}
@@ -144,7 +145,9 @@ def test_no_text_of_a_submission_becomes_markup() -> None:
     assert shapes[0] == shapes[1]
     scripts = [re.findall(r"<script>(.*?)</script>", text, re.DOTALL) for text in (harmless, hostile)]
     assert scripts[0] == scripts[1] and len(scripts[0]) == 4
-    assert all((a["href"] or "").startswith(("#", "viewer.html?", "leaderboard.json")) for a in Page(hostile).all("a"))
+    assert all(
+        (a["href"] or "").startswith(("#", "viewer/index.html#", "leaderboard.json")) for a in Page(hostile).all("a")
+    )
     (data,) = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', hostile, re.DOTALL)
     assert not set("<>&'") & set(data)
     assert {line["label"] for line in json.loads(data)["tables"][0]["iou"]} == {f"{k}{HOSTILE}" for k in range(3)}
@@ -306,15 +309,41 @@ def test_pictures_of_an_earlier_page_go_and_the_list_says_what_is_shown(tmp_path
 
 
 def test_the_viewer_is_linked_where_it_is(page: Path, run: Path, tmp_path: Path) -> None:
-    assert "viewer.html" not in markup(page)
+    """Shapes of every reconstruction that is pictured, and the episodes of every explorer."""
+    assert "viewer" not in markup(page)
     board, pictures = json.loads((page / "leaderboard.json").read_text()), read_pictures(page / "pictures")
-    (tmp_path / "viewer.html").touch()
+    hashes = [entry["content_hash"] for entry in board["tables"][0]["entries"]]
+    links = {(h, name): f"viewer/index.html#object={name}&entry={h}&view=shape" for h in hashes for name in NAMES}
+    write_links(links, tmp_path)
+    assert read_links(tmp_path) == {}  # the viewer is not there
+    (tmp_path / "viewer").mkdir()
+    (tmp_path / "viewer" / "index.html").touch()
+    assert read_links(tmp_path) == links
     write_page(board, pictures, tmp_path)
-    links = [urlsplit(a["href"] or "") for a in Page(markup(tmp_path)).all("a") if "viewer" in (a["href"] or "")]
-    assert {link.path for link in links} == {"viewer.html"}
-    found = {(q["entry"][0], q["object"][0]) for q in (parse_qs(link.query) for link in links)}
-    entries = [e for e in board["tables"][0]["entries"] if e["submission"]["reconstructor"] != "grid"]
-    assert found == {(entry["content_hash"], name) for entry in entries for name in NAMES}
+    found = [a["href"] or "" for a in Page(markup(tmp_path)).all("a") if "viewer" in (a["href"] or "")]
+    grid = {e["content_hash"] for e in board["tables"][0]["entries"] if e["submission"]["reconstructor"] == "grid"}
+    assert {a for a in found if "view=shape" in a} == {link for (h, _), link in links.items() if h not in grid}
+    assert len([a for a in found if "view=episode" in a]) == len(hashes) * len(NAMES)
+    for address in (
+        "javascript:alert(1)",
+        "../viewer/index.html#",
+        "viewer/../x.html#",
+        "https://example.org/viewer/index.html#",
+    ):
+        write_links({("a", "mug"): address}, tmp_path)
+        with pytest.raises(InvalidInputError, match="does not lead into the viewer"):
+            read_links(tmp_path)
+
+
+def test_a_page_with_its_viewer(run: Path, primitive_cache: Path, tmp_path: Path, monkeypatch) -> None:
+    """The command writes both; nothing is simulated where the hand is not prepared."""
+    monkeypatch.setenv("TSLAM_BENCH_CACHE", str(primitive_cache))
+    page_main([str(run), "--output", str(tmp_path), "--pictured", "0", "--viewer", "1"])
+    links = read_links(tmp_path)
+    assert {name for _, name in links} == {"mug"} and len(links) == 4
+    assert all((tmp_path / link.partition("#")[0]).is_file() for link in links.values())
+    text = markup(tmp_path)
+    assert "turn in 3D" in text and ">play<" in text and "no picture" in text
 
 
 def test_rows_that_would_read_alike_are_told_apart() -> None:

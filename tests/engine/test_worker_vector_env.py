@@ -6,13 +6,15 @@ import contextlib
 import hashlib
 import multiprocessing
 import os
+import selectors
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -300,11 +302,13 @@ def test_what_fails_in_the_caller_s_own_process_has_its_traceback_and_closes_the
 
 
 @contextlib.contextmanager
-def alarm(seconds: float) -> Iterator[None]:
-    """Raises ``Interruption`` after so many seconds, wherever this process is then."""
+def alarm(seconds: float, what: Callable[[], None] | None = None) -> Iterator[None]:
+    """Calls ``what``, or raises ``Interruption``, after so many seconds, wherever this process is then."""
 
     def ring(*_: object) -> None:
-        raise Interruption
+        if what is None:
+            raise Interruption
+        what()
 
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -355,6 +359,42 @@ def test_an_interrupted_environment_says_what_broke_it():
         envs.reset(seed=7)
     envs.close()
     envs.close()
+
+
+@pytest.mark.parametrize("closed", ["step", "reset", "state"])
+def test_an_environment_that_a_signal_handler_closes_in_the_middle_of_a_call_says_so(closed):
+    """As a batch system's warning before its time limit does; the call must not come back with what half the hands did."""
+    envs = tslam_bench.make_vec(ENVIRONMENT_ID, 2, "cpu", object="mug", processes=2)
+    envs.reset(seed=0)
+    processes = envs._hands.processes
+    os.kill(processes[0].pid, signal.SIGSTOP)
+    calls = {"step": (np.zeros((2, NUM_JOINTS), np.float32),), "reset": (), "state": ()}
+    with (
+        pytest.raises(
+            WorkerError, match=f"the workers were stopped in the middle of a {closed}; make a new environment"
+        ),
+        alarm(0.3, envs.close),
+    ):
+        getattr(envs, closed)(*calls[closed])
+    assert not any(process.is_alive() for process in processes)
+    with pytest.raises(WorkerError, match="make a new one"):
+        envs.state()
+
+
+def test_half_an_answer_is_the_end_of_a_worker():
+    workers = HandWorkers(2, BatchSettings("mug"), 2, timeout=60.0)
+    workers.reset([3, 4], [0, 1])
+    ours, theirs = multiprocessing.Pipe()
+    os.write(theirs.fileno(), struct.pack("!i", 1000) + bytes(10))  # a message of 1000 bytes begins
+    theirs.close()
+    process, pipe = workers._workers[1]
+    workers._selector.unregister(pipe)
+    workers._selector.register(ours, selectors.EVENT_READ, 1)
+    workers._workers[1] = (process, ours)
+    pipe.close()
+    with pytest.raises(WorkerError, match="worker 1: died"):
+        workers.state()
+    assert not process.is_alive()
 
 
 def test_workers_leave_ctrl_c_to_the_caller():

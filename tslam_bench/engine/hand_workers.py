@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from tslam_bench.engine.hand_batch import BatchSettings, HandBatch, batch_arrays
 from tslam_bench.errors import AssetError, BenchmarkError, InvalidInputError
 
+_BROKEN: Final = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError)
+"""What pipes and selectors raise once they are closed."""
 START_TIMEOUT: Final = 300.0
 """Seconds that the workers have for importing and building their scenes."""
 
@@ -151,13 +153,23 @@ class HandWorkers:
         """One request to every worker, and their answers to it."""
         if os.getpid() != self._owner:
             raise WorkerError("the vector environment belongs to the process that made it; make one in this process")
-        if not self._workers:
+        workers = self._workers
+        if not workers:
             raise WorkerError("the workers were stopped; make a new environment")
         try:
             self._number += 1
-            for (_, pipe), argument in zip(self._workers, arguments, strict=True):
+            for (_, pipe), argument in zip(workers, arguments, strict=True):
                 self._send(pipe, (self._number, name, argument))
             return self._collect(timeout)
+        except BenchmarkError:
+            self.stop()
+            raise
+        except _BROKEN as error:
+            if self._workers is workers:
+                self.stop()
+                raise
+            # A signal handler, or another thread, has closed them under our feet: pipes and selector are gone.
+            raise WorkerError(f"the workers were stopped in the middle of a {name}; make a new environment") from error
         except BaseException:  # what was asked for may still come: nobody may take it for the answer to something else
             self.stop()
             raise
@@ -169,23 +181,28 @@ class HandWorkers:
 
     def _collect(self, timeout: float, remedy: str = "make a new environment") -> list[Any]:
         """The answer of every worker to the last request, in order; stops all of them and raises if any fails."""
-        number = self._number
+        number, workers = self._number, self._workers
         answers: dict[int, Any] = {}
         left = timeout
-        while len(answers) < len(self._workers):
+        while len(answers) < len(workers):
             # In slices, so that time during which all processes are stopped (Ctrl-Z, a batch system) does not count.
             waited = min(left, 1.0)
             ready = self._selector.select(waited)
             left -= 0.0 if ready else waited
             if left <= 0:
-                silent = next(index for index in range(len(self._workers)) if index not in answers)
+                silent = next(index for index in range(len(workers)) if index not in answers)
                 self.stop()
                 raise WorkerError(f"worker {silent}: no answer for {timeout:g} s; all workers were stopped")
             for key, _ in ready:
-                process, pipe = self._workers[key.data]
+                process, pipe = workers[key.data]
                 try:
                     answered, kind, answer = pipe.recv()
-                except (EOFError, ConnectionResetError):  # a worker that dies closes its end of the pipe
+                except (
+                    EOFError,
+                    OSError,
+                ):  # a worker that dies closes its end of the pipe, maybe in the middle of an answer
+                    if self._workers is not workers:
+                        raise
                     process.join(5)
                     self.stop()
                     raise WorkerError(
@@ -199,7 +216,7 @@ class HandWorkers:
                     self.stop()
                     raise WorkerError(f"worker {key.data}: its answer was to another request; use one thread only")
                 answers[key.data] = answer
-        return [answers[index] for index in range(len(self._workers))]
+        return [answers[index] for index in range(len(workers))]
 
 
 def _available_cores() -> list[int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tslam_bench.constants import HORIZON
 from tslam_bench.engine.hand_batch import FINAL, BatchSettings, HandBatch, batch_arrays
 from tslam_bench.engine.hand_workers import HandWorkers, WorkerError
-from tslam_bench.engine.requests import check_action_repeat, check_actions, check_reset, check_whole
+from tslam_bench.engine.requests import ResetRequest, check_action_repeat, check_actions, check_reset, check_whole
 from tslam_bench.engine.same_step import info_at_the_end, with_masks
 from tslam_bench.engine.spaces import OBSERVATION_ARRAYS, action_space, observation_space
 from tslam_bench.errors import InvalidInputError
@@ -119,15 +119,7 @@ class TactileVectorEnv(VectorEnv):
         asked = check_reset(seed, options, self.num_envs, self._starts)
         if not (self._begun or asked.mask.all()):
             raise InvalidInputError("options['reset_mask']: the first reset is of all environments; leave it out")
-        envs = np.flatnonzero(asked.mask).tolist()
-        if envs:
-            seeds, objects, poses = (
-                [values[env] for env in envs] if values else None
-                for values in (asked.seeds, asked.objects, asked.poses)
-            )
-            self._ask(hands.reset, seeds, envs, objects, poses)
-        self._begun = True
-        return self._read(OBSERVATION_ARRAYS), with_masks(self._read(INFO), asked.mask.copy())
+        return self._whole("reset", self._reset, hands, asked)
 
     def step(self, actions: Any) -> tuple[dict[str, NDArray], NDArray, NDArray, NDArray, dict[str, Any]]:
         """One control step of every environment, or ``action_repeat`` of them.
@@ -140,8 +132,30 @@ class TactileVectorEnv(VectorEnv):
         checked = check_actions(actions, self.num_envs)
         if not self._begun:
             raise InvalidInputError("step: no episode has begun; call reset first")
-        self._arrays["action"][:] = checked
-        self._ask(hands.step, self.action_repeat)
+        return self._whole("step", self._step, hands, checked)
+
+    def state(self) -> dict[str, Any]:
+        """Objects, poses and touched steps (num_envs, 32, 32, 32) of the running episodes: for evaluation only."""
+        return self._whole("state", self._open().state)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stops the workers."""
+        hands, self._hands = self._hands, None
+        if isinstance(hands, HandWorkers):
+            hands.stop()
+
+    def _reset(self, hands: HandBatch | HandWorkers, asked: ResetRequest) -> tuple[Any, ...]:
+        envs = np.flatnonzero(asked.mask).tolist()
+        if envs:
+            objects = [asked.objects[env] for env in envs] if asked.objects else None
+            poses = [asked.poses[env] for env in envs] if asked.poses else None
+            hands.reset([asked.seeds[env] for env in envs], envs, objects, poses)
+        self._begun = True
+        return self._read(OBSERVATION_ARRAYS), with_masks(self._read(INFO), asked.mask.copy())
+
+    def _step(self, hands: HandBatch | HandWorkers, actions: NDArray[np.float32]) -> tuple[Any, ...]:
+        self._arrays["action"][:] = actions
+        hands.step(self.action_repeat)
         truncated = self._arrays["truncated"].copy()
         counts = self._read(INFO)
         if truncated.any():
@@ -154,27 +168,20 @@ class TactileVectorEnv(VectorEnv):
         reward = self._arrays["reward"].copy()
         return self._read(OBSERVATION_ARRAYS), reward, np.zeros_like(truncated), truncated, info
 
-    def state(self) -> dict[str, Any]:
-        """Objects, poses and touched steps (num_envs, 32, 32, 32) of the running episodes: for evaluation only."""
-        return self._ask(self._open().state)
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Stops the workers."""
-        hands, self._hands = self._hands, None
-        if isinstance(hands, HandWorkers):
-            hands.stop()
-
     def _open(self) -> HandBatch | HandWorkers:
         if self._hands is None:
             raise WorkerError(f"the vector environment {self._broken}; make a new one")
         return self._hands
 
-    def _ask(self, call: Callable[..., Any], *arguments: Any) -> Any:
-        """``call``; what fails or is interrupted leaves some hands a step ahead of others, so it closes the environment."""
+    def _whole(self, name: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """``call``, from its first effect to its answer; what fails or is interrupted in between closes the environment.
+
+        Some hands may be a step ahead of others then, or all may be a step ahead of what the caller knows.
+        """
         try:
             return call(*arguments)
         except BaseException as error:
-            self._broken = f"is closed since {call.__name__} ended with {type(error).__name__}"
+            self._broken = f"is closed since {name} ended with {type(error).__name__}"
             self.close_extras()
             raise
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from typing import Any, Final
+
+MAX_DIGITS: Final = 1000
+"""Digits of a whole number. Python itself refuses 4300 of them, with advice that is not meant for whoever sent a file."""
 
 
 def parse_json(data: bytes) -> Any:
@@ -16,7 +19,11 @@ def parse_json(data: bytes) -> Any:
     """
     try:
         value = json.loads(
-            data.decode("utf-8-sig"), parse_constant=_no_number, parse_float=_finite, object_pairs_hook=_object
+            data.decode("utf-8-sig"),
+            parse_constant=_no_number,
+            parse_float=_finite,
+            parse_int=_whole,
+            object_pairs_hook=_object,
         )
         if rb"\u" in data:
             json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -29,6 +36,12 @@ def parse_json(data: bytes) -> Any:
 
 def _no_number(name: str) -> None:
     raise ValueError(f"{name} is not a JSON number")
+
+
+def _whole(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
 
 
 def _finite(text: str) -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import socket
 import textwrap
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +38,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def submission(cache, tmp_path_factory) -> Path:
-    config = EvaluationConfig("heuristic", NAMES, (0,), object_set="quick", policy_salt="5a17", processes=1)
+    config = EvaluationConfig("heuristic", NAMES, (0,), object_set="quick", policy_salt="5a17", processes=0)
     (made,) = evaluate(config, make_reconstructors(("hull",)), tmp_path_factory.mktemp("heuristic"))
     return made
 
@@ -241,14 +243,24 @@ ATTACKS = """
                     pass
             return Volume(np.zeros((8, 8, 8), np.float32))
 """
+FORGED_HELLO = """
+    import json, os, struct
+
+    text = json.dumps({"control_mode": "", "confinement": {"network": "perfect", "files": "perfect"}, "arrays": []}).encode()
+    for descriptor in range(3, 30):
+        try:
+            os.write(descriptor, struct.pack("<I", len(text)) + text)
+        except OSError:
+            pass
+"""
 EMPTY = np.zeros((32, 32, 32), dtype=bool)
 
 
 @pytest.mark.parametrize("namespaces", [True, False])
-def test_code_that_is_shut_in_reaches_nothing(namespaces: bool, submission: Path, tmp_path: Path, monkeypatch) -> None:
-    import os
-    import socket
-
+def test_code_that_is_shut_in_reaches_nothing(namespaces: bool, tmp_path: Path, monkeypatch) -> None:
+    submission = tmp_path / "submission"
+    submission.mkdir()
+    (submission / "submission.json").write_text("{}")
     with socket.create_server(("127.0.0.1", 0)) as server:
         host, port = server.getsockname()
         for name, value in (
@@ -284,6 +296,12 @@ def test_code_that_does_not_answer_is_named(name: str, message: str, tmp_path: P
     given = Code("reconstructor", f"{code(tmp_path, ATTACKS)}:{name}")
     with pytest.raises((UserCodeError, InvalidInputError), match=message), ConfinedCode(given, limits) as confined:
         ConfinedReconstructor(confined, name).reconstruct(EMPTY, EMPTY)
+
+
+def test_how_it_is_shut_in_is_told_before_the_code_is_there(tmp_path: Path) -> None:
+    given = Code("reconstructor", f"{code(tmp_path, FORGED_HELLO)}:Nobody")
+    with ConfinedCode(given) as confined:
+        assert confined.confinement["network"] in ("namespace", "audit hook")
 
 
 def test_messages_are_read_as_they_were_written_and_nothing_else_is() -> None:

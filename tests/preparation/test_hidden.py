@@ -92,7 +92,7 @@ def test_an_opening_proves_that_nothing_was_exchanged(commitment: Path, tmp_path
 
 
 def test_a_hidden_split_is_explored_replayed_and_scored(commitment: Path, tmp_path: Path, capsys) -> None:
-    words = ("--policy", "random_targets", "--reconstructor", "hull", "--processes", "1", "--policy-salt", "ab")
+    words = ("--policy", "random_targets", "--reconstructor", "hull", "--processes", "0", "--policy-salt", "ab")
     main(["evaluate", *words, "--split", "hidden", "--output", str(tmp_path)])
     folder = tmp_path / "submissions" / "random_targets-hull"
     with pytest.raises(

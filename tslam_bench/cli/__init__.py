@@ -18,6 +18,7 @@ _COMMANDS = {
     "evaluate": ("tslam_bench.cli.evaluate", "main", "let a policy explore, reconstruct, and write submissions"),
     "view": ("tslam_bench.cli.view", "main", "watch episodes and turn shapes in the browser"),
     "verify": ("tslam_bench.cli.verify", "main", "replay a submission's rollouts and record which reproduce"),
+    "submit": ("tslam_bench.cli.submit", "main", "check a submission as a maintainer does, before it is sent"),
     "score": ("tslam_bench.cli.score", "score_main", "score submissions: a table and JSON"),
     "leaderboard": ("tslam_bench.leaderboard.commands", "page_main", "rank scored submissions and build the page"),
     "gpu-check": ("tslam_bench.cli.gpu_check", "main", "compare the GPU simulation with the CPU's"),

@@ -235,7 +235,7 @@ class _Run:
                 objects=self._objects,
                 split=self._submission.split,
                 control_mode=self._submission.info.control_mode,
-                processes=min(self._processes, SIDE_BY_SIDE),
+                processes=min(self._processes, SIDE_BY_SIDE) if self._processes > 1 else 0,  # 0: in this process
             )
         return self._envs
 

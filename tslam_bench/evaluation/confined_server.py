@@ -19,7 +19,7 @@ def serve(config: Mapping[str, Any], held: Mapping[str, str], requests: int, ans
 
     Args:
         config: ``kind`` (``policy`` or ``reconstructor``), ``code`` (id or reference), ``model`` (path or None), ``arguments``.
-        held: how the process is confined, told in the first answer.
+        held: how the process is confined. Told before the stranger's code is there, which could tell anything.
         requests, answers: file descriptors.
     """
 
@@ -37,12 +37,13 @@ def serve(config: Mapping[str, Any], held: Mapping[str, str], requests: int, ans
         while data:
             data = data[os.write(answers, data) :]
 
+    write({"confinement": dict(held)})
     try:
         made, mode = _make(config)
     except BenchmarkError as error:
         write(_refusal(error))
         return
-    write({"control_mode": mode, "confinement": dict(held)})
+    write({"control_mode": mode})
     while True:
         try:
             request = decode(read)

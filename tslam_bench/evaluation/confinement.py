@@ -6,8 +6,10 @@ What comes back are plain arrays of checked type, shape and range (:mod:`tslam_b
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -46,7 +48,7 @@ class Limits:
     cpu: int = 7200
     """CPU seconds of a process."""
     memory: float = 8.0
-    """GiB of address space."""
+    """GiB of address space of each process."""
     files: int = 256
     """MiB that it may write, all of it gone afterwards."""
     namespaces: bool = True
@@ -105,17 +107,17 @@ class ConfinedCode:
         self._folder = tempfile.TemporaryDirectory(prefix="tslam-confined-")
         self._process: subprocess.Popen | None = None
         try:
-            header = self._start(self._limits.namespaces)
+            self.confinement = self._start(self._limits.namespaces)
+            self.control_mode = str(self.ask(None, seconds=max(_START, self._limits.answer))[0].get("control_mode"))
         except BaseException:
             self.close()
             raise
-        self.control_mode: str = header["control_mode"]
-        self.confinement: dict[str, str] = header["confinement"]
         if code.kind == "policy" and self.control_mode not in CONTROL_MODES:
             self.close()
             raise InvalidInputError(f"{self._label}: its control_mode is none of {', '.join(CONTROL_MODES)}")
 
-    def _start(self, namespaces: bool) -> dict[str, Any]:
+    def _start(self, namespaces: bool) -> dict[str, str]:
+        """Starts the process; how it is shut in."""
         scratch = Path(self._folder.name) / "scratch"
         scratch.mkdir(exist_ok=True)
         self._log = Path(self._folder.name) / "log"
@@ -155,17 +157,24 @@ class ConfinedCode:
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)
         try:
-            return self._exchange(json.dumps(config).encode() + b"\n", max(_START, self._limits.answer))[0]
+            return self._exchange(json.dumps(config).encode() + b"\n", max(_START, self._limits.answer))[0][
+                "confinement"
+            ]
         except EOFError:
             if namespaces and self._process.wait() == _NO_NAMESPACES:
                 self._stop()
                 return self._start(namespaces=False)
             raise UserCodeError(self._death()) from None
 
-    def ask(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray] | None = None) -> Message:
-        """Sends a request and returns the answer. Raises UserCodeError or InvalidInputError as the constructor does."""
+    def ask(
+        self,
+        header: Mapping[str, Any] | None,
+        arrays: Mapping[str, NDArray] | None = None,
+        seconds: float | None = None,
+    ) -> Message:
+        """Sends a request (None: none) and returns the answer. Raises what the constructor raises."""
         try:
-            return self._exchange(encode(header, arrays), self._limits.answer)
+            return self._exchange(b"" if header is None else encode(header, arrays), seconds or self._limits.answer)
         except (EOFError, BrokenPipeError):
             raise UserCodeError(self._death()) from None
 
@@ -201,6 +210,9 @@ class ConfinedCode:
         process, self._process = self._process, None
         if process is None:
             return
+        for child in _children(process.pid):  # the first process of its namespace: all others in it end with it
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
         process.kill()
         process.wait()
         for stream in (process.stdin, process.stdout):
@@ -256,6 +268,13 @@ class ConfinedReconstructor:
         if "probability" not in arrays:
             raise InvalidInputError(f"reconstructor {self.name}: answered without a volume")
         return Volume(arrays["probability"].astype(np.float32), header.get("interpolation", ""))
+
+
+def _children(process: int) -> list[int]:
+    path = Path(f"/proc/{process}/task/{process}/children")
+    with contextlib.suppress(OSError):
+        return [int(child) for child in path.read_text().split()]
+    return []
 
 
 def _secrets(split: str) -> list[Path]:

@@ -49,7 +49,7 @@ def decode(read: Callable[[int], bytes]) -> Message:
     try:
         header = json.loads(read(length))
         stated = [(str(name), str(kind), [int(n) for n in shape]) for name, kind, shape in header.pop("arrays")]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise Garbled("a header that cannot be read") from error
     if any(kind not in _TYPES or len(shape) > 8 or min(shape, default=0) < 0 for _, kind, shape in stated):
         raise Garbled("an array of an unknown type or shape")

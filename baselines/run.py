@@ -6,7 +6,9 @@ hand; this module only plans them and hands them to :class:`tslam_bench.evaluati
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shlex
 import signal
 import sys
 import time
@@ -24,10 +26,12 @@ from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.episodes import check_salt
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.jobs import Job, JobRunner
+from tslam_bench.evaluation.launchers import LauncherName, make_launcher
 from tslam_bench.evaluation.policies import get_baseline
 from tslam_bench.evaluation.weights import METADATA_FILE, shipped_seeds, shipped_weights
 from tslam_bench.objects.splits import known_names
 from tslam_bench.objects.store import asset_sha256, list_objects
+from tslam_bench.plugins import parse_arguments
 from tslam_bench.reconstruction.registry import get_reconstructor
 from tslam_bench.reconstruction.registry import shipped_weights as shipped_reconstructor
 from tslam_bench.scoring.submission import INFO_FILE
@@ -77,7 +81,13 @@ class Arguments:
     output: Path | None = None
     """Folder of the run; default: runs/ and the preset's name."""
     workers: int = os.cpu_count() or 2
-    """Processes at a time."""
+    """Processes at a time; on a cluster: cores of one job that uses several."""
+    launcher: LauncherName = "local"
+    """Where the commands run: here, or on the machines of a Ray or SLURM cluster (docs/clusters.md)."""
+    address: str | None = None
+    """Of the Ray cluster; default: the one that runs here, or else a new one of this machine alone."""
+    slurm: tuple[str, ...] = ()
+    """Parameters of submitit, key=value: slurm_partition=cpu timeout_min=600 mem_gb=8."""
     dry_run: bool = False
     """Print the commands without running them."""
 
@@ -140,7 +150,10 @@ def _objects(settings: RunSettings) -> Command:
 
 
 def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
-    """These look into the cache, which others change too: they always run, and take seconds if all is there."""
+    """These look into the cache, which others change too: they always run, and take seconds if all is there.
+
+    One after the other: train and val objects are compared with those before them.
+    """
     prepare: Command = ("tslam-bench", "assets", "prepare")
     several: Command = ("--workers", str(workers))
     test_objects = ("--quick", "--split", "test") if settings.objects == QUICK_OBJECTS else _objects(settings)
@@ -153,7 +166,8 @@ def _asset_jobs(settings: RunSettings, workers: int) -> list[Job]:
     for split, names in settings.learning_objects:
         command = (*prepare, "--split", split, *_listed("--objects", names), *several)
         fingerprint = partial(_learning_sha256, split, names)
-        jobs.append(Job(f"assets-{split}", command, slots=workers, always=True, fingerprint=fingerprint))
+        before = (jobs[-1].name,)
+        jobs.append(Job(f"assets-{split}", command, before, slots=workers, always=True, fingerprint=fingerprint))
     return jobs
 
 
@@ -287,19 +301,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ]
         if settings.shipped and absent:
             print(f"run: no weights are shipped of {', '.join(absent)}", file=sys.stderr)
-        _run(plan(settings, output, parsed.workers), output, parsed.workers, parsed.dry_run)
+        jobs = plan(settings, output, parsed.workers)
+        if parsed.dry_run:
+            print("\n".join(shlex.join(job.command) for job in jobs))
+        else:
+            _run(jobs, output, parsed)
 
 
-def _run(jobs: list[Job], output: Path, workers: int, dry_run: bool) -> None:
-    if dry_run:
-        import shlex
-
-        print("\n".join(shlex.join(job.command) for job in jobs))
-        return
+def _run(jobs: list[Job], output: Path, arguments: Arguments) -> None:
     started = time.monotonic()
     form = "{l_bar}{bar}| {elapsed} {postfix}"
-    with Progress("run", "job", len(jobs), disable=not sys.stderr.isatty(), bar_format=form, mininterval=0) as bar:
-        JobRunner(output, workers, bar.write, bar.show).run(jobs)
+    slurm = parse_arguments(arguments.slurm)
+    engine = (output / "logs" / "submitit").absolute()
+    with (
+        contextlib.closing(
+            make_launcher(arguments.launcher, engine, arguments.workers, arguments.address, slurm)
+        ) as launcher,
+        Progress("run", "job", len(jobs), disable=not sys.stderr.isatty(), bar_format=form, mininterval=0) as bar,
+    ):
+        JobRunner(output, launcher, bar.write, bar.show).run(jobs)
     print(f"run: done in {(time.monotonic() - started) / 60:.1f} minutes: {output / 'index.html'}")
 
 

@@ -27,7 +27,10 @@ runs/<name>/index.html and leaderboard.json; logs are in runs/<name>/logs. Run i
   --retrain              train the learned reconstructors even if their weights are shipped
   --policy-salt DIGITS   hexadecimal digits that explorers' random numbers come from
   --output FOLDER        folder of the run (default: runs/ and the preset's name)
-  --workers N            processes at a time (default: the cores)
+  --workers N            processes at a time (default: the cores); on a cluster: cores of one job that uses several
+  --launcher NAME        local, ray or slurm: where the commands run (docs/clusters.md)
+  --address ADDRESS      of the Ray cluster
+  --slurm KEY=VALUE ...  parameters of submitit: slurm_partition=cpu timeout_min=600 mem_gb=8
   --dry-run              print the commands without running them
   --help                 this text
 USAGE

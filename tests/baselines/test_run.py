@@ -19,6 +19,7 @@ from tslam_bench.baselines.run import PRESETS, Arguments, plan, settings_of
 from tslam_bench.constants import QUICK_OBJECTS
 from tslam_bench.errors import InvalidInputError
 from tslam_bench.evaluation.jobs import Job, JobError, JobRunner
+from tslam_bench.evaluation.launchers import LocalLauncher
 from tslam_bench.evaluation.policies import list_baselines
 from tslam_bench.sources.generator.generate import candidates
 
@@ -26,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def runner(folder: Path, said: list[str] | None = None, workers: int = 2) -> JobRunner:
-    return JobRunner(folder, workers, (said if said is not None else []).append, lambda *_: None)
+    return JobRunner(folder, LocalLauncher(workers), (said if said is not None else []).append, lambda *_: None)
 
 
 def python(code: str) -> tuple[str, ...]:
@@ -267,7 +268,8 @@ def test_two_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
         "from tslam_bench.evaluation.jobs import Job, JobRunner\n"
         "from pathlib import Path\n"
         f"job = Job('long', ({sys.executable!r}, '-c', 'import time; time.sleep(60)'))\n"
-        f"JobRunner(Path({str(tmp_path)!r}), 1, print, lambda *_: None).run([job])\n"
+        "from tslam_bench.evaluation.launchers import LocalLauncher\n"
+        f"JobRunner(Path({str(tmp_path)!r}), LocalLauncher(1), print, lambda *_: None).run([job])\n"
     )
     first = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
     try:
@@ -306,7 +308,8 @@ if libc.prctl(38, 1, 0, 0, 0) or libc.prctl(22, 2, program, 0, 0):  # no new rig
 
 from pathlib import Path
 from tslam_bench.evaluation.jobs import Job, JobRunner
-runner = JobRunner(Path(sys.argv[1]), 1, print, lambda *_: None)
+from tslam_bench.evaluation.launchers import LocalLauncher
+runner = JobRunner(Path(sys.argv[1]), LocalLauncher(1), print, lambda *_: None)
 runner.run([Job("one", ("true",))])
 runner.run([Job("one", ("true",))])
 """

@@ -9,25 +9,22 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import re
 import shlex
-import signal
-import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from tslam_bench.errors import BenchmarkError, InvalidInputError
+from tslam_bench.evaluation.launchers import Launched, Launcher
+from tslam_bench.evaluation.work import LostError, Work
 from tslam_bench.files import ensure_writable_directory, write_json
 from tslam_bench.version import __version__
 
 _PERCENT: Final = re.compile(r"(\d{1,3})%\|")
-_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
 
 class JobError(BenchmarkError, RuntimeError):
@@ -43,7 +40,9 @@ class Job:
         command: program and arguments; ``tslam-bench`` is this installation's.
         after: names of the jobs that have to end well before.
         outputs: paths that it leaves; if one is gone it is run again.
-        slots: processes that it keeps busy.
+        slots: cores that it keeps busy.
+        retries: times that an engine starts it again where it is killed or its machine is lost. What a command has done it
+            does not do again.
         always: run it even if it was done before.
         fingerprint: called after the job; what it returns must be the same whenever the folder is used again.
     """
@@ -53,6 +52,7 @@ class Job:
     after: tuple[str, ...] = ()
     outputs: tuple[Path, ...] = ()
     slots: int = 1
+    retries: int = 2
     always: bool = False
     fingerprint: Callable[[], str] | None = None
 
@@ -60,9 +60,8 @@ class Job:
 @dataclass
 class _Running:
     job: Job
-    process: subprocess.Popen
+    launched: Launched
     log: Path
-    stream: IO[str]
     started: float = field(default_factory=time.monotonic)
 
 
@@ -71,7 +70,7 @@ class JobRunner:
 
     Args:
         folder: gets ``logs/<job>.log``, ``logs/<job>.json`` (stamps) and a lock.
-        workers: processes at a time.
+        launcher: runs their commands.
         say: prints one line.
         show: called about once a second with (jobs done, all jobs, what is running).
 
@@ -80,12 +79,10 @@ class JobRunner:
     """
 
     def __init__(
-        self, folder: Path, workers: int, say: Callable[[str], None], show: Callable[[int, int, str], None]
+        self, folder: Path, launcher: Launcher, say: Callable[[str], None], show: Callable[[int, int, str], None]
     ) -> None:
-        if workers < 1:
-            raise InvalidInputError(f"workers {workers}: must be at least 1")
-        self.logs = ensure_writable_directory(folder / "logs")
-        self.workers = workers
+        self.logs = ensure_writable_directory(folder / "logs").absolute()
+        self._launcher = launcher
         self._say, self._show = say, show
         self._stamps: dict[str, str] = {}
 
@@ -94,8 +91,9 @@ class JobRunner:
 
         Raises:
             JobError: a job failed (its log's last line is in the message); the others are stopped.
-            InvalidInputError: another run uses the same folder.
+            InvalidInputError: another run uses the same folder, or no machine has the cores that a job wants.
         """
+        self._launcher.check(max((job.slots for job in jobs), default=1))
         with _locked(self.logs / "run.lock") as lock:
             self._run(list(jobs), lock)
 
@@ -113,14 +111,15 @@ class JobRunner:
                         self._say(f"[{len(finished) + 1}/{len(jobs)}] {job.name}: done before")
                         finished.add(job.name)
                         waiting.remove(job)
-                    elif not running or sum(r.job.slots for r in running) + job.slots <= self.workers:
+                    elif self._has_room(running, job):
                         running.append(self._start(job, lock))
                         waiting.remove(job)
                 for current in list(running):
-                    if current.process.poll() is None:
+                    code = self._status(current)
+                    if code is None:
                         continue
                     running.remove(current)
-                    self._end(current)
+                    self._end(current, code)
                     finished.add(current.job.name)
                     seconds = time.monotonic() - current.started
                     self._say(f"[{len(finished)}/{len(jobs)}] {current.job.name}: done in {seconds:.0f} s")
@@ -129,7 +128,17 @@ class JobRunner:
                     time.sleep(0.2)
         finally:
             for current in running:
-                _stop(current)
+                current.launched.stop()
+
+    def _has_room(self, running: Sequence[_Running], job: Job) -> bool:
+        cores = self._launcher.cores
+        return not running or cores is None or sum(r.job.slots for r in running) + job.slots <= cores
+
+    def _status(self, current: _Running) -> int | None:
+        try:
+            return current.launched.poll()
+        except LostError as error:
+            raise JobError(f"{error} (log: {current.log})") from error
 
     def _stamp(self, job: Job) -> str:
         before = [self._stamps[name] for name in job.after]
@@ -152,23 +161,11 @@ class JobRunner:
     def _start(self, job: Job, lock: int | None) -> _Running:
         self._say(f"$ {shlex.join(job.command)}")
         log = self.logs / f"{job.name}.log"
-        stream = log.open("w", encoding="utf-8")
-        stream.write(f"$ {shlex.join(job.command)}\n")
-        stream.flush()
-        program = [sys.executable, "-m", "tslam_bench.cli"] if job.command[0] == "tslam-bench" else [job.command[0]]
-        process = subprocess.Popen(
-            [*program, *job.command[1:]],
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            env={**dict.fromkeys(_THREADS, "1"), **os.environ},
-            pass_fds=() if lock is None else (lock,),  # the lock is held until the last job is gone
-        )
-        return _Running(job, process, log, stream)
+        log.write_text(f"$ {shlex.join(job.command)}\n", encoding="utf-8")
+        work = Work(job.name, job.command, log, job.slots, job.retries)
+        return _Running(job, self._launcher.start(work, lock), log)
 
-    def _end(self, current: _Running) -> None:
-        current.stream.close()
-        code = current.process.returncode
+    def _end(self, current: _Running, code: int) -> None:
         missing = [output for output in current.job.outputs if not output.exists()]
         if code == 0 and not missing:
             fingerprint = current.job.fingerprint() if current.job.fingerprint else None
@@ -202,18 +199,6 @@ def _described(current: _Running) -> str:
 def _last_line(log: Path) -> str:
     lines = [line.strip() for line in re.split(r"[\r\n]", log.read_text(encoding="utf-8", errors="replace"))]
     return next((line for line in reversed(lines) if line), "no output")
-
-
-def _stop(current: _Running) -> None:
-    """Interrupts a job, then ends it."""
-    if current.process.poll() is None:
-        current.process.send_signal(signal.SIGINT)
-        try:
-            current.process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            current.process.kill()
-            current.process.wait()
-    current.stream.close()
 
 
 @contextlib.contextmanager

@@ -98,6 +98,7 @@ def ray_launcher(cluster: Any) -> Iterator[RayLauncher]:
     launcher.close()
 
 
+@pytest.mark.slow
 def test_a_ray_cluster_that_loses_a_node_leaves_the_files_of_a_local_run(cluster, ray_launcher, tmp_path) -> None:
     (doomed,) = cluster.worker_nodes
     mark, killed = f"(node {doomed.node_id[:8]})", []

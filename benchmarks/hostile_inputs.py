@@ -1,6 +1,7 @@
 """Wrong and hostile submissions, score files and meshes: some made by hand, the others by seeded damage to good ones.
 
-The same seed gives the same bytes (but for dates and ids in the COLLADA that trimesh writes). A case made by hand says what has to become of it.
+The same seed gives the same bytes (but for dates and ids in the COLLADA that trimesh writes). A case made by hand says what has
+to become of it.
 """
 
 from __future__ import annotations

@@ -337,6 +337,45 @@ def test_json_with_a_byte_order_mark(tmp_path) -> None:
     assert [source.name for source in read_set(tmp_path / "set.json")[1]] == ["shape"]
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"accessors": {"sparse": {"count": 1}}}, "sparse"),
+        ({"accessors": {"normalized": True}}, "quantised"),
+        ({"primitives": {"mode": 6}}, "triangle fans"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "compressed"),
+    ],
+)
+def test_gltf_that_cannot_be_read_whole(change: dict, reason: str) -> None:
+    header = mesh_mutations.gltf_header()
+    header["accessors"][0] |= change.get("accessors", {})
+    header["meshes"][0]["primitives"][0] |= change.get("primitives", {})
+    refused(mesh_mutations.glb(header | {k: v for k, v in change.items() if k == "extensionsRequired"}), ".glb", reason)
+
+
+def test_gltf_of_triangle_strips() -> None:
+    """A tetrahedron is one strip: 0 2 1 3 0 2."""
+    header = mesh_mutations.gltf_header()
+    header["meshes"][0]["primitives"][0]["mode"] = 5
+    header["accessors"][1]["count"] = 6
+    strip = np.array([0, 1, 2, 3, 0, 1] + 6 * [0], dtype="<u4")
+    body = mesh_mutations.glb(mesh_mutations.gltf_header())[-96:-48] + strip.tobytes()
+    mesh = parse_mesh(mesh_mutations.glb(header, body), ".glb", up="z")
+    read = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert read.is_watertight and abs(read.volume) == pytest.approx(1 / 6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (b"<instance_geometry", b'<instance_controller url="#c"/><instance_geometry', "moved by bones"),
+        (b"<triangles", b"<polygons><ph><p>0 1 2</p><h>0 1 2</h></ph></polygons><triangles", "holes"),
+    ],
+)
+def test_collada_that_cannot_be_read_whole(old: bytes, new: bytes, reason: str) -> None:
+    refused(mesh_mutations.collada().replace(old, new), ".dae", reason)
+
+
 # --- the second reader ------------------------------------------------------------------------------------------
 
 RIGHT_BY_TRIMESH = {

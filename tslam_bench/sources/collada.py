@@ -13,6 +13,13 @@ from tslam_bench.errors import AssetError
 
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 
+_UNREAD = {
+    "instance_controller": "parts that are moved by bones or morphed (controllers)",
+    "ph": "polygons with holes",
+    "brep": "curved surfaces (brep)",
+}
+"""Elements that are part of the shape and that trimesh leaves out."""
+
 
 @dataclass(frozen=True)
 class Document:
@@ -35,7 +42,7 @@ def inspect(data: bytes) -> Document:
 
     Raises:
         AssetError: not COLLADA, nodes that instance each other in a circle, a negative index (numpy would count it from the
-            end), or a unit or axis that makes no sense.
+            end), parts that are never read, or a unit or axis that makes no sense.
     """
     try:
         root = ElementTree.fromstring(data)
@@ -45,6 +52,9 @@ def inspect(data: bytes) -> Document:
         raise AssetError(f"not a COLLADA document: its root element is <{root.tag.rpartition('}')[2][:40]}>")
     if any("-" in (indices.text or "") for indices in root.iterfind(".//{*}p")):
         raise AssetError(".dae faces refer to vertices by negative numbers")
+    for tag, what in _UNREAD.items():
+        if root.find(f".//{{*}}{tag}") is not None:
+            raise AssetError(f".dae with {what}, which cannot be read; export it without")
     stated = root.find("./{*}asset/{*}unit")
     meter = "1" if stated is None else stated.get("meter", "1")
     up = (root.findtext("./{*}asset/{*}up_axis") or "Y_UP").strip()

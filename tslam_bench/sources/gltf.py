@@ -9,6 +9,8 @@ from urllib.parse import unquote
 
 from tslam_bench.errors import AssetError
 
+_TRIANGLE_FAN = 6
+
 
 def read_header(data: bytes, suffix: str) -> dict[str, Any]:
     """The JSON part of a ``.glb`` or ``.gltf`` file.
@@ -37,9 +39,29 @@ def _items(header: dict[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def check_data(header: dict[str, Any]) -> None:
-    """Raises AssetError for a mesh whose numbers are not in a buffer: trimesh would make as many zeros as are announced."""
-    if any("bufferView" not in accessor for accessor in _items(header, "accessors")):
+    """Raises AssetError for a mesh that trimesh would not read whole.
+
+    Numbers that are not in a buffer (it would make as many zeros as are announced), those that replace others, those that stand
+    for fractions, and triangle fans, which it leaves out.
+    """
+    accessors = _items(header, "accessors")
+    required = header.get("extensionsRequired", [])
+    compressed = isinstance(required, list) and any(
+        isinstance(name, str) and name.endswith(("_draco_mesh_compression", "_meshopt_compression"))
+        for name in required
+    )
+    if compressed or any("bufferView" not in accessor for accessor in accessors):
         raise AssetError("glTF is compressed, or has accessors without data; export it uncompressed")
+    if any("sparse" in accessor for accessor in accessors):
+        raise AssetError("glTF has sparse accessors, which cannot be read; export it without")
+    for mesh in _items(header, "meshes"):
+        for primitive in _items(mesh, "primitives"):
+            if primitive.get("mode") == _TRIANGLE_FAN:
+                raise AssetError("glTF has triangle fans, which cannot be read; export it as triangles")
+            attributes = primitive.get("attributes")
+            index = attributes.get("POSITION") if isinstance(attributes, dict) else None
+            if isinstance(index, int) and 0 <= index < len(accessors) and accessors[index].get("normalized"):
+                raise AssetError("glTF has quantised positions, which cannot be read; export it without quantisation")
 
 
 def referenced_files(header: dict[str, Any]) -> list[str]:

@@ -16,13 +16,14 @@ import resource
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 _NEW_USER, _NEW_NETWORK, _NEW_MOUNTS, _NEW_PROCESSES = 0x10000000, 0x40000000, 0x00020000, 0x20000000
 _RECURSIVE, _PRIVATE, _BIND = 0x4000, 1 << 18, 0x1000
 _MOUNT_SETATTR, _AT_RECURSIVE, _READ_ONLY = 442, 0x8000, 1
 _DIE_WITH_PARENT, _NO_NEW_PRIVILEGES, _DROP_BOUNDING = 1, 38, 24
 _PROCESSES = 64
+_NO_NAMESPACES = 71
 _REFUSED = (
     "socket.",
     "subprocess.",
@@ -76,7 +77,10 @@ def _shut_in(config: dict[str, Any]) -> dict[str, str] | None:
     if libc.unshare(_NEW_USER | _NEW_NETWORK | _NEW_MOUNTS | _NEW_PROCESSES):
         return None
     for name, line in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
-        Path("/proc/self", name).write_text(line)
+        try:
+            Path("/proc/self", name).write_text(line)
+        except OSError as error:  # some systems give the namespace and nothing in it
+            _give_up(error)
     child = os.fork()  # the first process of the new namespace: when it ends, all others in it do
     if child:
         for descriptor in (0, 1):
@@ -87,14 +91,19 @@ def _shut_in(config: dict[str, Any]) -> dict[str, str] | None:
     try:
         _mount_all(libc, config)
     except OSError as error:
-        print(f"confinement: {error}", file=sys.stderr)
-        os._exit(71)  # half of it is worse than the other way: the parent asks for that one
+        _give_up(error)
     for capability in range(64):
         libc.prctl(_DROP_BOUNDING, capability, 0, 0, 0)
     header, none = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
     if libc.capset(header, none) or libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0):
-        os._exit(71)
+        _give_up(OSError("privileges cannot be dropped"))
     return {"network": "namespace", "files": "read only, truth hidden"}
+
+
+def _give_up(error: OSError) -> NoReturn:
+    """Half of it is worse than the other way: the parent asks for that one."""
+    print(f"confinement: {error}", file=sys.stderr, flush=True)
+    os._exit(_NO_NAMESPACES)
 
 
 def _mount_all(libc: ctypes.CDLL, config: dict[str, Any]) -> None:

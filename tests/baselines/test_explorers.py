@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from tslam_bench.baselines.frontier import FrontierBaseline
 from tslam_bench.baselines.heuristic import GraspConfig, HeuristicBaseline
 from tslam_bench.baselines.learned_policy import LearnedBaseline
 from tslam_bench.baselines.model_files import make_network, read_model, write_model
@@ -58,6 +59,7 @@ def make(kind: str, policy) -> Policy:
         "random": RandomBaseline,
         "random_targets": RandomTargetsBaseline,
         "heuristic": HeuristicBaseline,
+        "frontier": FrontierBaseline,
         "learned": lambda: LearnedBaseline(policy, "pd_joint_pos"),
         "learned held": lambda: LearnedBaseline(policy, "pd_joint_pos", 4),
         "learned mean": lambda: LearnedBaseline(policy, "pd_joint_pos", deterministic=True),
@@ -80,7 +82,7 @@ def moving_hand(baseline: Policy, seeds: list[int], steps: int, floor: float = -
 # -- registry ---------------------------------------------------------------------------------------------------------
 def test_baselines_cover_every_reward_mode_once() -> None:
     baselines = [spec for spec in list_baselines() if spec.kind != "reference"]
-    assert len(baselines) == 11
+    assert len(baselines) == 12
     learned = [spec for spec in baselines if spec.kind == "learned"]
     assert sorted(str(spec.reward_mode) for spec in learned) == sorted(REWARD_MODES)
     assert [spec.id for spec in learned if spec.privileged] == [f"tslam_{mode}" for mode in PRIVILEGED_REWARD_MODES]
@@ -206,7 +208,9 @@ def test_scripted_baselines_need_no_torch() -> None:
 
 
 # -- every policy -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned held", "learned mean"])
+@pytest.mark.parametrize(
+    "kind", ["random", "random_targets", "heuristic", "frontier", "learned", "learned held", "learned mean"]
+)
 def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> None:
     first = moving_hand(make(kind, policy), [5, 6], 40)
     again = moving_hand(make(kind, policy), [5, 6], 40)
@@ -216,7 +220,9 @@ def test_actions_are_in_range_and_repeat_with_the_seed(kind: str, policy) -> Non
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("kind", ["random", "random_targets", "heuristic", "learned", "learned held", "learned mean"])
+@pytest.mark.parametrize(
+    "kind", ["random", "random_targets", "heuristic", "frontier", "learned", "learned held", "learned mean"]
+)
 def test_an_episode_does_not_depend_on_its_batch(kind: str, policy) -> None:
     together = moving_hand(make(kind, policy), [11, 12, 13], 60)
     alone = moving_hand(make(kind, policy), [12], 60)

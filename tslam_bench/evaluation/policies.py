@@ -67,6 +67,11 @@ _POLICIES: Final = Registry(
             "tslam_bench.baselines.heuristic:HeuristicBaseline",
             "power grasp from a randomly placed open hand, reopened and repeated",
         ),
+        _scripted(
+            "frontier",
+            "tslam_bench.baselines.frontier:FrontierBaseline",
+            "goes where its own map says that surface is likely and unfelt",
+        ),
         _learned("tslam", "tslam", "PPO on novel touched voxels plus coverage of free space"),
         _learned("tslam_no_coverage", "no_coverage", "PPO on novel touched voxels alone"),
         _learned("tslam_no_discovery", "no_discovery", "PPO on coverage of free space alone"),

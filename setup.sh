@@ -10,7 +10,7 @@ set_up_environment() {
     local root stamp base found owner
     root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
     PYTHON="$root/.venv/bin/python"
-    found="$(cat "$root/.venv/tslam-bench.stamp" 2>/dev/null)"
+    found="$(cat "$root/.venv/tslam-bench.stamp" 2>/dev/null || true)"  # callers stop at errors
     stamp="$(cat "$root/pyproject.toml" "$root/constraints.txt" | cksum) $root"
     if [ -x "$PYTHON" ] && [ "$found" = "$stamp" ]; then
         return 0

@@ -36,7 +36,7 @@ def interpreter(folder: Path, version: str = "3.11.9") -> Path:
 def set_up(clone: Path, python: Path, **variables: str) -> tuple[int, str]:
     """Exit status and output of a set-up; what was installed is in ``log`` beside the clones."""
     environment = {**os.environ, "PYTHON_FOR_VENV": str(python), **variables}
-    command = ["bash", "-c", "source ./setup.sh; set_up_environment"]
+    command = ["bash", "-c", "set -euo pipefail; source ./setup.sh; set_up_environment"]  # as run_all.sh and run.sh do
     done = subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
 

@@ -3,7 +3,8 @@
     python benchmarks/reconstruction.py --data runs/touches/val --reconstructors carve unet=runs/unet.pt --output val.jsonl
 
 One line of JSON per reconstructor: mean IoU after 1, 2, 4 and 8 poses for each explorer whose episodes were collected, for the
-whole surface (`oracle`), calibration error, and seconds of CPU per reconstruction. The test split is refused.
+whole surface (`oracle`), calibration error, and seconds of CPU per reconstruction. The test split is refused. `--document`
+replaces the section `val` of a page by the table of all lines of `--output`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from report import machine, markdown_table, replace_section
 
 from tslam_bench.cli.ending import one_line_errors
 from tslam_bench.constants import OCCUPANCY_THRESHOLD
@@ -37,10 +39,12 @@ class Config:
 
     data: Path
     """Folder of `tslam-bench reconstruct collect`."""
-    reconstructors: tuple[str, ...]
+    reconstructors: tuple[str, ...] = ()
     """Ids, or ID=FILE for those that need a model."""
     output: Path | None = None
     """File that the lines are appended to."""
+    document: Path | None = None
+    """Page whose section `val` is replaced by the table."""
     split: str = "val"
     """Split of the objects: val or train."""
     objects: tuple[str, ...] = ()
@@ -94,6 +98,22 @@ def measure(made: Reconstructor, data: Path, items: list[PreparedObject]) -> dic
     }
 
 
+def section(lines: list[dict[str, Any]]) -> str:
+    """Markdown of all lines, the best first."""
+    explorers = sorted({name for line in lines for name in line["iou"]})
+    header = ("reconstructor", "objects")
+    for name in explorers:
+        header += (f"`{name}`: area", "1 / 2 / 4 / 8 poses")  # type: ignore[assignment]
+    rows = []
+    for line in sorted(lines, key=lambda line: -line["area"][explorers[0]]):
+        row = [line["label"], line["objects"]]
+        for name in explorers:
+            row += [f"{line['area'][name]:.3f}", " / ".join(f"{value:.3f}"[1:] for value in line["iou"][name])]
+        worst = max(line["calibration_error"].values())
+        rows.append((*row, f"{line['oracle']:.3f}", f"{worst:.3f}", f"{line['cpu_seconds']:.2f}"))
+    return f"{machine()}.\n\n" + markdown_table((*header, "all touched", "worst ECE", "CPU s"), rows)
+
+
 def main() -> None:
     """Prints and appends a line per reconstructor."""
     config = tyro.cli(Config, description=__doc__)
@@ -101,11 +121,17 @@ def main() -> None:
     for text in config.reconstructors:
         name, _, path = text.partition("=")
         made = make_reconstructor(name, Path(path) if path else None)
-        line = json.dumps({"reconstructor": text, "split": config.split, **measure(made, config.data, items)})
+        label = f"`{name}`" + (f" ({Path(path).stem})" if path else "")
+        line = json.dumps(
+            {"reconstructor": text, "label": label, "split": config.split, **measure(made, config.data, items)}
+        )
         print(line, flush=True)
         if config.output is not None:
             with config.output.open("a", encoding="utf-8") as stream:
                 stream.write(line + "\n")
+    if config.document is not None and config.output is not None:
+        lines = [json.loads(text) for text in config.output.read_text(encoding="utf-8").splitlines()]
+        replace_section(config.document, "val", section(lines))
 
 
 if __name__ == "__main__":

@@ -31,8 +31,8 @@ class RunSettings:
         reconstructors: ids; learned ones whose weights are not shipped are trained first.
         reconstruction_training: further arguments of ``tslam-bench reconstruct train``.
         retrain: learned reconstructors are trained even if their weights are shipped.
-        collect: arguments of ``tslam-bench reconstruct collect``, whose touches the reconstructors learn from; none: they learn
-            from touches that are simulated as it goes.
+        collected: reconstructors learn from touches that are collected first; else from touches that are simulated as it goes, if
+            they can.
         remark: shown beside the figures of learned baselines.
         policy_salt: where explorers' random numbers and the order of episodes come from. Ours do not look at it, so it is fixed:
             a run gives the same figures everywhere.
@@ -52,7 +52,7 @@ class RunSettings:
     policy_salt: str = "2021"
     shipped: bool = False
     retrain: bool = False
-    collect: tuple[str, ...] = ()
+    collected: bool = False
 
 
 _QUICK_TRAINING: Final = (
@@ -75,7 +75,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         steps=32_000,
         training=_QUICK_TRAINING,
         learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
+        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
         reconstruction_training=("--steps", "300"),
         remark="proves the path, not the method",
         shipped=True,
@@ -103,7 +103,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         steps=0,
         training=(),
         learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
+        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
         reconstruction_training=("--steps", "1000"),
         remark="",
     ),
@@ -116,7 +116,7 @@ PRESETS: Final[dict[str, RunSettings]] = {
         steps=0,
         training=(),
         learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
+        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
         reconstruction_training=("--steps", "1000"),
         remark="",
         shipped=True,
@@ -130,11 +130,11 @@ PRESETS: Final[dict[str, RunSettings]] = {
         steps=PAPER_STEPS,
         training=(),
         learning_objects=(("train", ()),),
-        reconstructors=("grid", "hull", "carve", "ifnet"),
+        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
         reconstruction_training=("--steps", "20000", "--batch-size", "16", "--points", "2048"),
         remark="",
         retrain=True,
-        collect=("--repetitions", "1"),
+        collected=True,
     ),
 }
 """``quick``: a leaderboard within 15 minutes on 2 cores. ``tiny``: the same path in a minute or two, for CI. ``scripted``: what

@@ -34,6 +34,7 @@ from tslam_bench.objects.store import asset_sha256, list_objects
 from tslam_bench.plugins import parse_arguments
 from tslam_bench.reconstruction.registry import get_reconstructor
 from tslam_bench.reconstruction.registry import shipped_weights as shipped_reconstructor
+from tslam_bench.reconstruction.training_config import COLLECTED_ONLY
 from tslam_bench.scoring.submission import INFO_FILE
 
 from .presets import PRESETS, RunSettings
@@ -199,17 +200,17 @@ def _training_jobs(settings: RunSettings, output: Path) -> list[Job]:
     learning = dict(settings.learning_objects)
     held_out = "val" if "val" in learning else "train"
     threshold = ("--threshold-split", held_out, *_listed("--threshold-objects", learning[held_out]))
-    models, after = _models(settings, output), _learning_assets(settings)
-    data: Command = ()
-    if settings.collect and models:
-        touches = output / "touches"
-        command: Command = ("tslam-bench", "reconstruct", "collect", "--output", str(touches), *settings.collect)
+    models, touches = _models(settings, output), output / "touches"
+    collected = {name for name in models if settings.collected or name in COLLECTED_ONLY}
+    if collected:
+        command: Command = ("tslam-bench", "reconstruct", "collect", "--output", str(touches))
         command += _listed("--objects", learning["train"])
         jobs.append(Job("collect-touches", command, (_TEST_ASSETS, "assets-train"), always=True))
-        after, data = ("collect-touches",), ("--data", str(touches))
     for name, model in models.items():
-        command = ("tslam-bench", "reconstruct", "train", "--architecture", name, *data)
-        command += (*_listed("--objects", learning["train"]), *(() if data else threshold))
+        after = ("collect-touches",) if name in collected else _learning_assets(settings)
+        command = ("tslam-bench", "reconstruct", "train", "--architecture", name)
+        command += ("--data", str(touches)) if name in collected else threshold
+        command += _listed("--objects", learning["train"])
         command += (*settings.reconstruction_training, "--output", str(model))
         jobs.append(Job(f"train-{name}", command, after, (model,)))
     for name in settings.baselines:

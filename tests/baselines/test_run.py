@@ -87,6 +87,10 @@ def test_reconstructors_are_trained_where_no_weights_are_shipped_or_it_is_asked_
     assert trained(Arguments(quick=True)) == set()
     assert trained(Arguments(quick=True, retrain=True)) >= {"train-ifnet"}
     assert trained(Arguments(full=True)) >= {"train-ifnet"}
+    (unet,) = (
+        job for job in plan(settings_of(Arguments(quick=True, retrain=True)), tmp_path, 2) if job.name == "train-unet"
+    )
+    assert "--data" in unet.command and unet.after == ("collect-touches",)  # it learns from collected touches only
     (collect,) = (job for job in plan(PRESETS["full"], tmp_path, 2) if job.name == "collect-touches")
     full = {job.name: job for job in plan(PRESETS["full"], tmp_path, 2)}
     assert full["train-ifnet"].after == ("collect-touches",)

@@ -19,7 +19,7 @@ from tslam_bench.files import atomic_file, check_output
 from tslam_bench.grids import merge, world_to_object
 from tslam_bench.reconstruction.inputs import read_grids
 from tslam_bench.reconstruction.registry import list_reconstructors, make_reconstructor
-from tslam_bench.reconstruction.training_config import TrainingConfig
+from tslam_bench.reconstruction.training_config import COLLECTED_ONLY, TrainingConfig
 
 _SIMULATED_STREAM = 4  # keeps the simulated touches apart from other uses of the seed
 
@@ -192,9 +192,9 @@ def _train(parsed: Train) -> None:
     if parsed.data is not None:
         _train_on_data(parsed, names)
         return
-    if config.architecture == "unet":
+    if config.architecture in COLLECTED_ONLY:
         raise InvalidInputError(
-            "unet: learns from collected touches; give --data FOLDER (tslam-bench reconstruct collect)"
+            f"{config.architecture}: learns from collected touches; give --data FOLDER (tslam-bench reconstruct collect)"
         )
     try:
         held_out = training_names(parsed.threshold_split, None, parsed.threshold_objects)

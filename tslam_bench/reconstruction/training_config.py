@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from tslam_bench.errors import InvalidInputError
+
+COLLECTED_ONLY: Final = ("unet",)
+"""Architectures that learn from collected touches only."""
 
 
 @dataclass(frozen=True)

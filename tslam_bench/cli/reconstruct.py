@@ -91,7 +91,7 @@ class Collect:
 class Export:
     """Write trained networks in half precision, with the record of their training, into one file that can be shipped."""
 
-    models: tuple[Path, ...]
+    models: tyro.conf.Positional[tuple[Path, ...]]
     """Checkpoints of one architecture; several unet are averaged."""
     output: Path
     """File to write, ending in .safetensors."""

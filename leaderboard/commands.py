@@ -28,7 +28,6 @@ from .pictures import TOUCHED_AS_THEY_ARE, Picture, make_pictures, touched_pictu
 from .ranking import rank
 from .shown import PICTURES, Key, Links, Shown, read_links, write_links, write_pictures
 from .training import find_records, read_records
-from .viewer import write_entries_viewer
 
 PAGE_FILE: Final = "index.html"
 DATA_FILE: Final = "leaderboard.json"
@@ -113,6 +112,8 @@ def page_main(arguments: Sequence[str]) -> None:
         )
     images = {key: drawn[picture] for key, picture in pictures.items() if picture in drawn}
     if parsed.viewer > 0 and submissions and parsed.split == "test":
+        from .viewer import write_entries_viewer  # needs libigl, which scoring and pages do without
+
         turned = {name for table in leaderboard["tables"] for name in first_objects(table, parsed.viewer)}
         with Progress("viewer", "object", leave=False) as bar:
             write_links(write_entries_viewer(parsed.output, submissions, turned, on_progress=bar.show), parsed.output)

@@ -176,6 +176,11 @@ def test_a_failed_run_cancels_its_submitit_jobs(slurm_launcher, tmp_path) -> Non
     with pytest.raises(JobError, match="bad failed"):
         run_jobs(tmp_path, slurm_launcher, [slow, bad])
     assert time.monotonic() - begun < 50
+    until = time.monotonic() + 60
+    while (
+        "KeyboardInterrupt" not in log_of(tmp_path, "slow") and time.monotonic() < until
+    ):  # it ends after it was cancelled
+        time.sleep(0.2)
     assert "KeyboardInterrupt" in log_of(tmp_path, "slow")
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import igl
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -119,6 +118,8 @@ def _net_of_mesh(solid: NDArray[np.bool_], mesh: trimesh.Trimesh) -> Net:
     if len(corners) and _meetings(mesh) <= _MOST_WORK:
         centres = WORKSPACE_LOW + edge * (corners + 0.5)
         vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+        import igl  # pages without shapes to turn do without it
+
         nearest = igl.point_mesh_squared_distance(centres, vertices, faces)[2]
         place = np.clip((nearest - WORKSPACE_LOW) / edge - corners, 0, 1)
     return Net(solid, _quantised(place))
@@ -173,6 +174,8 @@ def signed_distances(points: NDArray, vertices: NDArray, faces: NDArray) -> NDAr
     """(M,) exact distances (m) of ``points`` (M, 3) to a closed mesh, negative inside."""
     mesh = (np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64))
     points = np.ascontiguousarray(points, dtype=np.float64)
+    import igl
+
     distance = np.sqrt(np.maximum(igl.point_mesh_squared_distance(points, *mesh)[0], 0))
     return np.where(igl.fast_winding_number(*mesh, points) > 0.5, -distance, distance)
 

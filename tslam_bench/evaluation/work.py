@@ -27,6 +27,7 @@ _CARRIED: Final = ("TSLAM_BENCH_CACHE", "XDG_CACHE_HOME", "PYTHONPATH")
 _DIES_WITH_ITS_PARENT: Final = (
     "import ctypes, os, signal, sys\n"
     "ctypes.CDLL(None).prctl(1, signal.SIGKILL)\n"  # PR_SET_PDEATHSIG
+    "signal.signal(signal.SIGINT, signal.SIG_DFL)\n"  # ignored in what a shell runs behind itself; it is how a job is stopped
     "signal.signal(signal.SIGUSR2, signal.SIG_IGN)\n"  # SLURM tells every process of a job that its time is up
     "os.getppid() == int(sys.argv[1]) or sys.exit('the process that started this has gone')\n"
     "os.execv(sys.argv[2], sys.argv[2:])\n"

@@ -385,7 +385,8 @@ def _children() -> list[int]:
 def main(config: Config) -> None:
     """Prints the figures; exits with 1 if anything was wrong."""
     figures = Soak(config).run()
-    value = {"config": {**asdict(config), "output": None}, **asdict(figures)}
+    outcomes, figures.outcomes = dict(sorted(figures.outcomes.items())), Counter()  # asdict cannot copy a Counter
+    value = {"config": {**asdict(config), "output": None}, **asdict(figures), "outcomes": outcomes}
     print(json.dumps(value, indent=2))
     if config.output is not None:
         write_json(config.output, value)

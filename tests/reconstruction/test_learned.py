@@ -24,12 +24,15 @@ from tslam_bench.reconstruction.learned import (
     build_network,
     save_checkpoint,
 )
+from tslam_bench.reconstruction.levels import level_of_best_iou
 from tslam_bench.reconstruction.registry import make_reconstructor
+from tslam_bench.reconstruction.touch_data import NEVER, ExploredObject, TouchObject
 from tslam_bench.reconstruction.touch_simulation import TouchSimulation, simulate_touches
 from tslam_bench.reconstruction.trained import load_reconstructor
 from tslam_bench.reconstruction.training import THRESHOLDS, best_threshold, draw_batch, learning_rate, train
 from tslam_bench.reconstruction.training_config import TrainingConfig
 from tslam_bench.reconstruction.training_shapes import place, training_shape
+from tslam_bench.reconstruction.weights import save_weights
 from tslam_bench.scoring.metrics import iou
 
 torch.set_num_threads(1)
@@ -152,6 +155,48 @@ def test_refinement_changes_nothing_near_the_surface():
     assert np.array_equal(volume.probability >= 0.5, full >= 0.5)
     assert np.allclose(volume.probability[np.abs(full - 0.5) < 0.2], full[np.abs(full - 0.5) < 0.2], atol=1e-6)
     assert np.abs(volume.probability - full).max() < 0.1
+
+
+class Ripples(torch.nn.Module):
+    """Occupancy that is low everywhere, between 0.06 and 0.23, in waves that a coarse lattice does not see."""
+
+    config = SimpleNamespace(resolutions=(16, 32))
+
+    def encode(self, grids):
+        return [grids]
+
+    def decode(self, features, points):
+        return -2 + 0.8 * torch.sin(points[..., 0] * (2 * np.pi / (WORKSPACE_EDGE / 9)) + 0.3)
+
+
+@pytest.mark.parametrize("threshold", [0.12, None])
+def test_low_levels_are_refined_like_high_ones(threshold):
+    touched = EMPTY.copy()
+    touched[3, 4, 5] = True
+    volume = LearnedReconstructor("ripples", Ripples(), threshold=threshold).reconstruct(touched, EMPTY)
+    points = torch.from_numpy(grids.voxel_centres().reshape(-1, 3).astype(np.float32))
+    full = torch.sigmoid(Ripples().decode([], points)).numpy().reshape((GRID_SIZE,) * 3)
+    level = level_of_best_iou(full) if threshold is None else threshold
+    clear = np.abs(full - level) > 1e-4
+    assert np.array_equal((volume.probability >= 0.5)[clear], (full >= level)[clear])
+
+
+@pytest.mark.parametrize("architecture", POINT_NETWORKS)
+def test_networks_for_points_learn_from_collected_touches(architecture, smallest_ifnet, tmp_path, box):
+    """Their level follows from their own probabilities, through a checkpoint and through exported weights."""
+    surface, free = box.surface, ~box.solid
+    first = np.where(np.stack([surface, free]), 0, NEVER).astype(np.uint8)
+    item = TouchObject.of(box, [ExploredObject(np.stack([first] * 8), np.arange(8))], None)
+    config = dataclasses.replace(TINY, architecture=architecture, steps=60, learning_rate=1e-2)
+    made = train([item], config, tmp_path / "model.pt")
+    assert made.threshold is None
+    save_weights(tmp_path / "model.safetensors", [tmp_path / "model.pt"], {})
+    shipped = load_reconstructor(tmp_path / "model.safetensors", architecture)
+    assert shipped.threshold is None
+    sample = box.iou_points()
+    for reconstructor in (made, shipped):
+        solid = reconstructor.reconstruct(surface, free).query(sample.points) >= 0.5
+        assert iou(solid, box.solid_at_iou_points, sample.weights) > 0.5
 
 
 def test_nothing_touched_gives_nothing():

@@ -20,7 +20,7 @@ from tslam_bench.files import atomic_file
 from tslam_bench.grids import voxel_centres
 from tslam_bench.reconstruction import convonet, ifnet, unet
 from tslam_bench.reconstruction.inputs import check_grids, empty_volume
-from tslam_bench.reconstruction.levels import volume_at_level
+from tslam_bench.reconstruction.levels import LOWEST, volume_at_level
 from tslam_bench.reconstruction.torch_threads import torch_threads
 from tslam_bench.reconstruction.volume import Volume
 
@@ -195,24 +195,26 @@ class LearnedReconstructor:
             size = self.resolutions[0]
             probability = self._query(features, voxel_centres(size).reshape(-1, 3)).reshape((size,) * 3)
             for size in self.resolutions[1:]:
-                wanted = _twice(_level_in_reach(probability) | maximum_filter(_holds_touch(touched, size // 2), 3))
+                wanted = _twice(self._level_in_reach(probability) | maximum_filter(_holds_touch(touched, size // 2), 3))
                 probability = zoom(probability, 2, order=1, mode="nearest", grid_mode=True)
                 probability[wanted] = self._query(features, voxel_centres(size)[wanted])
-        return volume_at_level(np.clip(probability, 0, 1), self.threshold)
+        probability = np.clip(probability, 0, 1)
+        return Volume(probability, "linear") if self.threshold is not None else volume_at_level(probability)
 
     def _query(self, features: list[torch.Tensor], points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Probabilities (M,) at points (M, 3)."""
+        """Probabilities (M,) at points (M, 3), the threshold's at 0.5."""
         batches = torch.from_numpy(points.astype(np.float32)).split(self.batch_points)
         logits = [self.network.decode(features, batch[None])[0] for batch in batches]  # type: ignore[operator]
         if not logits:
             return np.zeros(0, dtype=np.float32)
-        return torch.sigmoid(torch.cat(logits)).numpy()
+        offset = 0.0 if self.threshold is None else float(np.log(self.threshold / (1 - self.threshold)))
+        return torch.sigmoid(torch.cat(logits) - offset).numpy()
 
-
-def _level_in_reach(probability: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Cells whose 3^3 neighbourhood has values above 0.25 and values below 0.75."""
-    high, low = maximum_filter(probability, 3), minimum_filter(probability, 3)
-    return np.asarray((high > OCCUPANCY_THRESHOLD / 2) & (low < 1 - OCCUPANCY_THRESHOLD / 2))
+    def _level_in_reach(self, probability: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Cells whose 3^3 neighbourhood has values above half the lowest level that there may be, and values below 0.75."""
+        lowest = LOWEST if self.threshold is None else OCCUPANCY_THRESHOLD
+        high, low = maximum_filter(probability, 3), minimum_filter(probability, 3)
+        return np.asarray((high > lowest / 2) & (low < 1 - OCCUPANCY_THRESHOLD / 2))
 
 
 def _holds_touch(touched: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:

@@ -54,8 +54,7 @@ class ExploredObject:
 
     def save(self, folder: Path, name: str) -> None:
         """Writes the object's file, atomically."""
-        with atomic_file(explored_file(folder, name)) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, first=self.first, poses=self.poses)
+        _write(explored_file(folder, name), first=self.first, poses=self.poses)
 
     @classmethod
     def load(cls, folder: Path, name: str) -> ExploredObject:
@@ -85,8 +84,7 @@ class SimulatedObject:
 
     def save(self, folder: Path, name: str) -> None:
         """Writes the object's file, atomically."""
-        with atomic_file(explored_file(folder, name)) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, grids=self.grids, scales=self.scales)
+        _write(explored_file(folder, name), grids=self.grids, scales=self.scales)
 
     @classmethod
     def load(cls, folder: Path, name: str) -> SimulatedObject:
@@ -113,6 +111,11 @@ def simulate_object(item: PreparedObject, count: int, generator: np.random.Gener
         grids.append([pack(touches.touched), pack(touches.visited)])
         scales.append(scale)
     return SimulatedObject(np.array(grids, dtype=np.uint8), np.array(scales))
+
+
+def _write(path: Path, **arrays: NDArray) -> None:
+    with atomic_file(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _read(path: Path, names: Sequence[str]) -> dict[str, NDArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from tslam_bench.constants import QUICK_OBJECTS, QUICK_TRAIN_OBJECTS, QUICK_VAL_OBJECTS
@@ -65,6 +65,19 @@ _QUICK_TRAINING: Final = (
     "--torch-threads",
     "1",
 )
+_SCRIPTED: Final = RunSettings(
+    name="scripted",
+    objects=(),
+    object_set="test",
+    baselines=tuple(spec.id for spec in list_baselines() if spec.kind != "learned"),
+    seeds=(0, 1, 2),
+    steps=0,
+    training=(),
+    learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
+    reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
+    reconstruction_training=("--steps", "1000"),
+    remark="",
+)
 PRESETS: Final[dict[str, RunSettings]] = {
     "quick": RunSettings(
         name="quick",
@@ -94,33 +107,8 @@ PRESETS: Final[dict[str, RunSettings]] = {
         remark="shows that everything runs, nothing else",
         retrain=True,
     ),
-    "scripted": RunSettings(
-        name="scripted",
-        objects=(),
-        object_set="test",
-        baselines=("random", "random_targets", "heuristic", "frontier", "oracle", "nothing"),
-        seeds=(0, 1, 2),
-        steps=0,
-        training=(),
-        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
-        reconstruction_training=("--steps", "1000"),
-        remark="",
-    ),
-    "shipped": RunSettings(
-        name="shipped",
-        objects=(),
-        object_set="test",
-        baselines=ALL_BASELINES,
-        seeds=(0, 1, 2),
-        steps=0,
-        training=(),
-        learning_objects=(("train", QUICK_TRAIN_OBJECTS), ("val", QUICK_VAL_OBJECTS)),
-        reconstructors=("grid", "hull", "carve", "ifnet", "unet"),
-        reconstruction_training=("--steps", "1000"),
-        remark="",
-        shipped=True,
-    ),
+    "scripted": _SCRIPTED,
+    "shipped": replace(_SCRIPTED, name="shipped", baselines=ALL_BASELINES, shipped=True),
     "full": RunSettings(
         name="full",
         objects=(),

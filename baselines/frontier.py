@@ -53,7 +53,7 @@ _AGENTS: Final = 4
 
 @dataclass(frozen=True)
 class FrontierConfig:
-    """Numbers of the explorer, found by ``benchmarks/tune_frontier.py`` on train objects.
+    """Numbers of the explorer, set by hand and compared on train objects; ``benchmarks/tune_frontier.py`` would search them.
 
     Lengths are in voxel edges, noise and places in halves of joint ranges, as actions are.
 
